@@ -1,4 +1,4 @@
-"""What all tests need."""
+"""Fixtures and settings of all tests."""
 
 from __future__ import annotations
 
@@ -16,17 +16,17 @@ HERE = Path(__file__).resolve().parent
 sys.path.insert(0, str(HERE))
 
 COMPILES = ('commands', 'test_warm_up.py')
-"""The file whose tests compile all kernels."""
+"""The file with tests that compile all kernels."""
 
 NO_KERNELS = ('bags', 'files')
-"""Folders whose tests need no kernel, or few."""
+"""Folders of tests that need no kernels, or few."""
 
 SHARED = Path(__file__).resolve().parents[2] / 'shared'
 
 
 @pytest.fixture
 def shared() -> Path:
-    """The folder of real recordings beside the checkout."""
+    """The folder of real recordings next to the checkout."""
     if not (SHARED / 'data').is_dir():
         pytest.skip(f'the real recordings are not at {SHARED}')
     return SHARED
@@ -34,22 +34,22 @@ def shared() -> Path:
 
 @pytest.fixture
 def domain() -> Iterator[int]:
-    """A DDS domain that nobody else has: no other test, and no other run of the tests on this machine."""
+    """A DDS domain that no other test uses, and no other run of the tests on this machine."""
     with own_domain() as number:
         yield number
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Have all kernels compiled at once, and by one worker alone: the other does meanwhile what needs none of them.
+    """Sort tests so that one worker compiles all kernels, while the other runs tests without kernels.
 
-    Whoever calls a kernel that is not in the cache compiles it, so that two workers that began with tests of the core
-    would both compile all of it.
+    A kernel that is not in the cache is compiled by the process that calls it, so two workers that began with tests of
+    the core would both compile all kernels.
     """
     items.sort(key=lambda item: turn(item.path))
 
 
 def turn(path: Path) -> int:
-    """When the tests of a file have their turn; files of one turn come in the order of their names."""
+    """The position of a file in the order of tests; files of the same turn are sorted by name."""
     parts = path.parts[len(HERE.parts) :]
     if parts == COMPILES:
         return 0
@@ -57,13 +57,13 @@ def turn(path: Path) -> int:
 
 
 def pytest_configure() -> None:
-    """Have participants of DDS find each other soon, and hear Ctrl-C, here and in the processes that tests start.
+    """Set fast discovery for DDS participants, and default signal handlers, also for the processes that tests start.
 
-    A shell without job control has background commands ignore Ctrl-C, and `nohup` a terminal that closes; processes
-    hand that down.
+    In shells without job control, background commands ignore Ctrl-C, and `nohup` ignores the end of a terminal; child
+    processes inherit this.
 
-    Bytecode is written even where the environment says not to: hundreds of processes start, and each would compile
-    the sources of the package, which takes a quarter of a start.
+    Bytecode is written even if the environment disables it: hundreds of processes start, and each would compile the
+    sources of the package, which takes a quarter of the start.
     """
     os.environ.pop('PYTHONDONTWRITEBYTECODE', None)
     sys.dont_write_bytecode = False

@@ -1,4 +1,4 @@
-"""What the pages of the documentation name, and whether it exists.
+"""The names on the pages of the documentation, and whether they exist.
 
 Sources are parsed and not imported, so that pages about the node are checked without ROS.
 """
@@ -23,7 +23,7 @@ PACKAGE = ROOT / 'forward_grid_mapper'
 PAGES = [ROOT / 'README.md', ROOT / 'CONTRIBUTING.md', *sorted((ROOT / 'docs').glob('*.md'))]
 
 FOLDERS = (ROOT, PACKAGE, PACKAGE / 'core', ROOT / 'test')
-"""Where a path in a page may begin, beside the page's own folder."""
+"""Folders where a path on a page may begin, in addition to the folder of the page."""
 
 SHOWN = r'(?:benchmarks|config|docs|launch|rviz|scripts|test|core|files|bags|node|commands|\.ci)/[\w./-]*\w'
 """A path inside the repository, in a command line or in prose."""
@@ -31,17 +31,17 @@ SHOWN = r'(?:benchmarks|config|docs|launch|rviz|scripts|test|core|files|bags|nod
 SETTABLE = {row.name for row in table.TABLE}
 
 PARAMETERS = {row.name: row for row in (*table.TABLE, *table.CONSTANTS)}
-"""Parameters, and the constants that a page may name beside them."""
+"""Parameters, and constants that a page may name."""
 
 DEPRECATED = {*former_parameters.DEPRECATED, *former_parameters.RENAMED} - {*PARAMETERS}
-"""Former names of parameters, which a page may give only where it says so."""
+"""Former names of parameters; a page must mark them as former."""
 
 SAYS_SO = re.compile(r'deprecated|former|was called|old name|until the next version', re.IGNORECASE)
 
 NUMBER = r'-?\d+(?:\.\d+)?(?:e-?\d+)?'
 
 
-# What exists
+# Existing names
 
 
 @cache
@@ -60,7 +60,7 @@ def sources() -> dict[str, list[Path]]:
 
 
 def _targets(node: ast.AST) -> Iterator[str]:
-    """Names that a statement binds, plain ones and attributes of `self`."""
+    """Names bound by a statement: plain names and attributes of `self`."""
     for target in getattr(node, 'targets', [getattr(node, 'target', None)]):
         for part in ast.walk(target) if target is not None else ():
             if isinstance(part, ast.Name):
@@ -71,7 +71,7 @@ def _targets(node: ast.AST) -> Iterator[str]:
 
 @cache
 def names_in(path: Path) -> frozenset[str]:
-    """What a file defines: functions, classes, constants, and members as `Class.member`."""
+    """The definitions of a file: functions, classes, constants, and members as `Class.member`."""
     found = set()
     for node in tree_of(path).body:
         if isinstance(node, (ast.FunctionDef, ast.ClassDef)):
@@ -89,7 +89,7 @@ def names_in(path: Path) -> frozenset[str]:
 
 @cache
 def texts_in(*folders: str) -> frozenset[str]:
-    """The string constants of these folders or files of the package."""
+    """String constants of these folders or files of the package."""
     found = set()
     for folder in folders:
         place = PACKAGE / folder
@@ -102,7 +102,7 @@ def texts_in(*folders: str) -> frozenset[str]:
 
 @cache
 def ros_types() -> frozenset[str]:
-    """Message and service types that the package uses, with and without the folder."""
+    """Message and service types used by the package, with and without the folder."""
     named = {text for text in texts_in('bags', 'replay', 'node') if re.fullmatch(r'\w+/(msg|srv)/\w+', text)}
     for path in PACKAGE.rglob('*.py'):
         for node in ast.walk(tree_of(path)):
@@ -113,14 +113,14 @@ def ros_types() -> frozenset[str]:
 
 @cache
 def topics() -> frozenset[str]:
-    """The node's own topics and services, without `~/`, and topics with a name of their own."""
+    """Topics and services of the node, without `~/`, and topics with their own name."""
     texts = texts_in('node')
     maps = next(
         ast.literal_eval(node.value)
         for node in tree_of(PACKAGE / 'node' / 'map_publishers.py').body
         if isinstance(node, ast.Assign) and 'MAPS' in _targets(node)
     )
-    # a text that ends so is completed by the name of a map
+    # a text that ends like this is completed by the name of a map
     stems = [text[2:] for text in texts if text.startswith('~/') and text.endswith(('/', '_'))]
     return frozenset(
         {text[2:] for text in texts if text.startswith('~/')}
@@ -131,7 +131,7 @@ def topics() -> frozenset[str]:
 
 @cache
 def launch_arguments() -> frozenset[str]:
-    """The arguments of the launch files: those declared by name, and the parameters that are arguments as well."""
+    """Arguments of the launch files: those declared by name, and parameters that are arguments as well."""
     found = set()
     for path in (ROOT / 'launch').glob('*.py'):
         for node in ast.walk(tree_of(path)):
@@ -143,7 +143,7 @@ def launch_arguments() -> frozenset[str]:
 
 
 def is_value(name: str) -> bool:
-    """Whether `name` is a number, or a parameter's default or one of its choices."""
+    """Whether `name` is a number, or the default or a choice of a parameter."""
     texts = {text for row in table.TABLE for text in row.choices}
     for row in PARAMETERS.values():
         default = row.default
@@ -174,7 +174,7 @@ def programs() -> tuple[str, ...]:
 
 
 def is_path(name: str, page: Path) -> bool:
-    """Whether a file or folder of the repository is called so; a bare name may be that of any one module."""
+    """Whether a file or folder of the repository has this name; a bare name must belong to exactly one module."""
     name = name.rstrip('/')
     for folder in (page.parent, *FOLDERS):
         if (folder / name).exists() or ('/' in name and (folder / f'{name}.py').exists()):
@@ -183,7 +183,7 @@ def is_path(name: str, page: Path) -> bool:
 
 
 def files_of(name: str) -> list[Path]:
-    """The Python files that `name` may mean, given with a folder or without."""
+    """The Python files with this name, given with or without folder."""
     if '/' in name:
         return [folder / name for folder in FOLDERS if (folder / name).is_file()]
     return sources().get(name, [])
@@ -205,7 +205,7 @@ def is_test(name: str) -> bool:
 
 
 def command_line(text: str, page: Path) -> str:
-    """Return what is wrong with a command line, '' if nothing is."""
+    """Return the fault of a command line, or '' if there is none."""
     for path in re.findall(SHOWN, text):
         if not is_path(path, page):
             return f'{path} does not exist'
@@ -217,7 +217,7 @@ def command_line(text: str, page: Path) -> str:
             return f'{name} is neither topic nor service'
     ours = 'forward_grid_mapper' in text or 'ros2 run' not in text
     for name in re.findall(r'(?:-p|--set) (\w+):?=', text) if ours else ():
-        # NAME stands for any
+        # NAME stands for any name
         if name not in SETTABLE and name != 'NAME':
             return f'{name} is no parameter'
     words = text.split('#', maxsplit=1)[0].split()
@@ -245,21 +245,21 @@ def is_setting(name: str) -> bool:
 
 
 def is_spoken(name: str) -> bool:
-    """Whether the node or a written file says so: topics, services, diagnostics, reasons, names of results."""
+    """Whether the node or a written file contains it: topics, services, diagnostics, reasons, names of results."""
     if name in REASONS or name in ODOMETRY_REASONS or name in ros_types():
         return True
     if re.sub(r'^(~/|/forward_grid_mapper/|…/)', '', name) in topics() or is_value(name):
         return True
     if f'RangeMessage.{name}' in names_in(PACKAGE / 'core' / 'messages' / 'message_types.py'):
         return True
-    # what follows a colon in a key is filled in
+    # the part of a key after a colon is variable
     keys = {text.rstrip(': ') for text in texts_in('node')}
     return name in keys | texts_in('files') or name.split(': ', maxsplit=1)[0] in keys
 
 
 @cache
 def library_names() -> frozenset[str]:
-    """What programs of others import and use: functions of the library, their arguments, and what its results have."""
+    """Names that other programs use: functions of the library, their arguments, and attributes of results."""
     found = {'grid.shape', 'grid.extent'}
     for node in ast.walk(tree_of(PACKAGE / 'library.py')):
         if isinstance(node, ast.FunctionDef):
@@ -270,7 +270,7 @@ def library_names() -> frozenset[str]:
 
 
 def exists(name: str, page: Path) -> bool:
-    """Whether anything in the repository has this name."""
+    """Whether the repository contains this name."""
     first = name.split(maxsplit=1)[0] if name.split() else ''
     if '::' in name or re.fullmatch(r'test_\w+', name):
         return is_test(name)
@@ -301,7 +301,7 @@ def without_blocks(text: str) -> str:
 
 
 def blocks(text: str) -> list[str]:
-    """The lines of a page's code blocks, continued lines joined; what programs print is left out."""
+    """The lines of the code blocks of a page, with continued lines joined, and without output of programs."""
     fenced = re.findall(r'^```(\w*)\n(.*?)^```', text, flags=re.MULTILINE | re.DOTALL)
     rest = re.sub(r'^```.*?^```', '', text, flags=re.MULTILINE | re.DOTALL)
     found = [body for kind, body in fenced if kind != 'text']
@@ -310,7 +310,7 @@ def blocks(text: str) -> list[str]:
 
 
 def wrong_names(text: str, page: Path, allowed: dict[str, str]) -> list[str]:
-    """The names in code spans and prose for which nothing exists; `allowed` are words that need not."""
+    """Names in code spans and prose that do not exist; `allowed` are exceptions."""
     wrong = []
     prose = without_blocks(text)
     for paragraph in re.split(r'\n\s*\n|\n(?=\|)', prose):
@@ -336,18 +336,18 @@ def wrong_names(text: str, page: Path, allowed: dict[str, str]) -> list[str]:
 
 
 def wrong_commands(text: str, page: Path) -> list[str]:
-    """What is wrong with the command lines in code blocks."""
+    """Faults of command lines in code blocks."""
     return [f'{line}: {fault}' for line in blocks(text) if (fault := command_line(line, page))]
 
 
 def anchors(text: str) -> set[str]:
-    """The anchors of a page's headings."""
+    """The anchors of the headings of a page."""
     heads = re.findall(r'^#+ (.+)$', without_blocks(text), flags=re.MULTILINE)
     return {re.sub(r'[^\w\- ]', '', head.lower()).replace(' ', '-') for head in heads}
 
 
 def wrong_links(text: str, page: Path) -> list[str]:
-    """Links and images that lead nowhere; addresses on the net are not followed."""
+    """Links and images without target; URLs are not followed."""
     wrong = []
     for target in re.findall(r'\]\(([^)\s]+)\)', without_blocks(text)):
         if re.match(r'https?:', target):
@@ -362,7 +362,9 @@ def wrong_links(text: str, page: Path) -> list[str]:
 
 
 def wrong_defaults(text: str) -> list[str]:
-    """Parameters whose default is another: in tables with a column `default`, and in brackets after bold words."""
+    """Parameters with another default than stated: in a column `default` of tables, and in brackets
+    after bold words.
+    """
     stated = []
     column = None
     for line in text.splitlines():

@@ -1,4 +1,4 @@
-"""Memory that runs out at a chosen point: the allocations of a call are counted, and one of them fails."""
+"""Lack of memory at a chosen point: allocations of a call are counted, and one of them fails."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ OURS: tuple[tuple[Any, str], ...] = (
 
 
 def _place() -> tuple[Any, ...]:
-    """Return the lines that led to an allocation."""
+    """Return the lines of code that led to an allocation."""
     frame, lines = sys._getframe(2), []
     while frame is not None:
         lines.append((frame.f_code, frame.f_lineno))
@@ -40,7 +40,7 @@ def _place() -> tuple[Any, ...]:
 
 
 class Allocations:
-    """Counts allocations, and lets one of them fail."""
+    """Counts allocations, and makes one of them fail."""
 
     def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
         self.count, self.fails = 0, 0
@@ -62,9 +62,9 @@ class Allocations:
         return counted
 
     def to_fail(self, work: Callable[[], object]) -> list[int]:
-        """Return the allocations of `work` that are worth failing, and at the end one more than it has.
+        """Return the numbers of the allocations of `work` to be tested, and at the end one more than it has.
 
-        Of those that one place makes again and again, called by the same lines, they are the first and the last.
+        Of allocations repeated at one place, called by the same lines, only the first and the last are tested.
         """
         self._places = {}
         with self.failing(0):
@@ -75,7 +75,7 @@ class Allocations:
 
     @contextmanager
     def failing(self, which: int) -> Iterator[None]:
-        """Let the allocation number `which`, counted from 1 and from here on, fail."""
+        """Make allocation number `which` fail, counted from 1 from now on."""
         self.count, self.fails, self._counting = 0, which, True
         try:
             yield

@@ -1,4 +1,4 @@
-"""A row of cells with three obstacles, and readings along it that are drawn from the model itself."""
+"""A row of cells with three obstacles, and readings along it drawn from the model."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ def line_map() -> np.ndarray:
 
 
 def drawn(rng: np.random.Generator, count: int, model: ModelParameters = TRUTH, repeat: int = 1) -> Readings:
-    """Readings of a sensor that looks along the line; each comes `repeat` times in a row."""
+    """Readings of a sensor that looks along the line; each is repeated `repeat` times."""
     distance = 0.05 + 0.1 * (np.array([*OBSTACLES, 0]) - model.surface_offset)
     distance[-1] = Z_MAX
     answers = np.c_[rng.random((count, len(OBSTACLES))) < model.p_hit, np.ones(count, bool)]

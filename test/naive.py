@@ -1,4 +1,4 @@
-"""Plain-Python twins of the kernels: slow, obvious, and written from the definitions alone."""
+"""Twins of the kernels in plain Python: slow, obvious, and written only from the definitions."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ def cone_cells(
     grid: Grid,
     slack: float = 0.0,
 ) -> dict[int, float]:
-    """Cells of a cone and their distances in metres; `slack` widens it, to tell rounding from error."""
+    """Cells of a cone and their distances in metres; `slack` widens it, to distinguish rounding from errors."""
     x, y, yaw = pose
     cells = {}
     xs, ys = grid.centers()
@@ -80,14 +80,14 @@ def of_cells(model: ModelParameters, grid: Grid) -> ModelParameters:
 
 
 def lost(z: float, z_max: float, sigma: float, model: ModelParameters) -> float:
-    """Density of a lost echo, which is no echo and so of the largest range."""
+    """Density of a lost echo, which is no echo, so the range is the largest."""
     return model.p_lost * normal(z, z_max, sigma) if z >= z_max else 0.0
 
 
 def causes(z: float, z_max: float, sigma: float, distances: list[float], model: ModelParameters) -> list[float]:
-    """Density of the reading together with each cause: chance, lost echo, no obstacle, first obstacle, second, …
+    """Density of the reading together with each cause: random, lost echo, no obstacle, first obstacle, second, …
 
-    Every pattern of obstacles that would return the echo and obstacles that would not is enumerated; the nearest that
+    All patterns of obstacles that would return the echo and obstacles that would not are enumerated; the nearest that
     would return it explains the reading.
     """
     distances = sorted(distances)
@@ -110,7 +110,7 @@ def sigma_of(readings: Readings, t: int, grid: Grid, model: ModelParameters) -> 
 def left_out(
     readings: Readings, t: int, grid: Grid, model: ModelParameters, normals: SurfaceNormals | None
 ) -> set[int]:
-    """The cells that reading t meets beyond the incidence angle and passes, by the definition."""
+    """The cells that reading t meets beyond the incidence angle and passes, by definition."""
     if normals is None or not len(normals.known):
         return set()
     xs, ys = grid.centers()
@@ -133,7 +133,7 @@ def obstacles(
     model: ModelParameters,
     normals: SurfaceNormals | None = None,
 ) -> list[float]:
-    """Distances of the occupied cells that reading t can meet."""
+    """Distances of the occupied cells that reading t may meet."""
     passed = left_out(readings, t, grid, model, normals)
     cells = cells_of(readings, t, grid, model)
     return [d for c, d in cells.items() if occupied.ravel()[c] == 1 and c not in passed]
@@ -164,18 +164,18 @@ def log_likelihood(
 
 
 def free_end(readings: Readings, t: int, grid: Grid, model: ModelParameters) -> float:
-    """Where the free zone of reading t ends and its band begins, in metres."""
+    """The distance where the free zone of reading t ends and its band begins, in metres."""
     return readings.z[t] - CUT * sigma_of(readings, t, grid, model)
 
 
 def reach(readings: Readings, t: int, grid: Grid, model: ModelParameters) -> float:
-    """The distance in metres beyond which no cell matters to reading t."""
+    """The distance in metres beyond which cells do not affect reading t."""
     end = readings.z[t] + CUT * sigma_of(readings, t, grid, model)
     return end if end < readings.z_max[t] else readings.z_max[t]
 
 
 def surface(grid: Grid, model: ModelParameters) -> float:
-    """How far the surface of an obstacle lies before what the distance to its cell is measured to, in metres."""
+    """The distance in metres of the surface of an obstacle in front of the point to which distances are measured."""
     return model.surface_offset * grid.resolution
 
 
@@ -189,11 +189,11 @@ def cells_of(readings: Readings, t: int, grid: Grid, model: ModelParameters, sla
 
 
 def strength(readings: Readings, t: int, grid: Grid, c: int) -> float:
-    """How much of the beam of reading t there is at cell c: 1 on the axis, 0 at the edge and beyond."""
+    """The strength of the beam of reading t at cell c: 1 on the axis, 0 at the edge and beyond."""
     xs, ys = grid.centers()
     dx, dy = xs[c % grid.width] - readings.x[t], ys[c // grid.width] - readings.y[t]
     off_axis = math.sin(math.atan2(dy, dx) - readings.yaw[t])
-    # half the cone is at least three quarters of a cell wide where the cell's centre is
+    # half the cone is at least three quarters of a cell wide at the centre of the cell
     edge = max(math.sin(readings.half_angle[t]), 0.75 * grid.resolution / max(math.hypot(dx, dy), 1e-9))
     return max(0.0, 1 - (off_axis / edge) ** 2)
 
@@ -213,7 +213,7 @@ def live_log_odds(
     for t in range(len(readings)):
         x, y, yaw, z = readings.x[t], readings.y[t], readings.yaw[t], readings.z[t]
         echo = z < readings.z_max[t]
-        # angles between lines, not arrows
+        # angles between lines, not directed
         k = int(np.argmin([abs(math.remainder(yaw - centre, math.pi)) for centre in centres]))
         length = 2 * z * math.sin(readings.half_angle[t])
         for c, d in cone_cells((x, y, yaw), readings.half_angle[t], z + behind if echo else z, grid).items():
@@ -226,16 +226,18 @@ def live_log_odds(
     out = np.full(grid.size, np.nan)
     for c in np.flatnonzero(touched):
         together = sum(apart[:, c])
-        said = [apart[k, c] + (apart[k - 1, c] + apart[(k + 1) % directions, c]) / 16 for k in range(directions)]
-        out[c] = max(*said, together) if directions > 1 and max(said) > 0 else together
+        by_direction = [
+            apart[k, c] + (apart[k - 1, c] + apart[(k + 1) % directions, c]) / 16 for k in range(directions)
+        ]
+        out[c] = max(*by_direction, together) if directions > 1 and max(by_direction) > 0 else together
     return out.reshape(grid.shape)
 
 
 def awkward_readings(rng: np.random.Generator, grid: Grid, count: int) -> Readings:
-    """Readings at the edges of what there is.
+    """Edge cases of readings.
 
-    Sensors on corners, edges and centres of cells, inside and outside of the grid, that look along rows, columns and
-    diagonals; cones from a thread to a half plane; ranges from none to beyond the grid.
+    Sensors on corners, edges and centres of cells, inside and outside the grid, that look along rows, columns and
+    diagonals; cones from very thin to a half plane; ranges from zero to beyond the grid.
     """
     size, span = grid.resolution, max(grid.width, grid.height)
     places = rng.integers(-4, 2 * span + 4, (2, count)) / 2 + rng.choice([0.0, 0.0, 0.25, 1e-13], (2, count))
@@ -255,7 +257,7 @@ def awkward_readings(rng: np.random.Generator, grid: Grid, count: int) -> Readin
 
 
 def pairs_of(state: State, t: int) -> tuple[list[int], list[int], list[float], list[int]]:
-    """What is stored of reading t: the cells of its runs in order; cells, densities and logs of its band."""
+    """The stored pairs of reading t: the cells of its runs in order; cells, densities and logs of its band."""
     reading_state = state.reading_states[t]
     assert reading_state['stored']
     words = state.pairs.cell[reading_state['at'] :]
@@ -270,7 +272,7 @@ def pairs_of(state: State, t: int) -> tuple[list[int], list[int], list[float], l
 
 
 def readings_of_tile(tiles: Tiles, tile: int) -> list[int]:
-    """The readings in the list of a tile, the one entered last at the end."""
+    """The readings in the list of a tile, the last one at the end."""
     chunk, fill, out = tiles.head[tile], tiles.fill[tile], []
     while chunk >= 0:
         out = tiles.chunks[chunk, :fill].tolist() + out
@@ -279,7 +281,7 @@ def readings_of_tile(tiles: Tiles, tile: int) -> list[int]:
 
 
 def neighbours_of(c: int, shape: tuple[int, int]) -> dict[int, int]:
-    """The neighbours of a cell on the grid, by their bearing in eighths of a turn from east."""
+    """The neighbours of a cell on the grid, by bearing in eighths of a turn from east."""
     row, column = divmod(c, shape[1])
     out = {}
     for y, x in itertools.product((-1, 0, 1), repeat=2):
@@ -293,14 +295,14 @@ def pattern_of(occupied: np.ndarray, c: int, shape: tuple[int, int]) -> int:
 
 
 def log_prior(prior: Prior, occupied: np.ndarray, shape: tuple[int, int]) -> float:
-    """That of a whole map, cell by cell."""
+    """The log prior of a whole map, cell by cell."""
     cells = np.flatnonzero(occupied.ravel()).tolist()
     return math.fsum(prior.local[c] + prior.shape[pattern_of(occupied, c, shape)] for c in cells)
 
 
 def prior_gain(prior: Prior, occupied: np.ndarray, c: int, shape: tuple[int, int]) -> float:
-    """What flipping cell c adds to the log prior: the difference of two whole maps, of which the rest is left out."""
-    # only the cell and its neighbours are priced otherwise afterwards
+    """The change of the log prior by flipping cell c: the difference of two whole maps, without the unchanged rest."""
+    # only the prices of the cell and its neighbours change
     nearby = {c, *neighbours_of(c, shape).values()}
     flipped = occupied.copy().ravel()
     flipped[c] ^= 1
@@ -318,7 +320,7 @@ def log_likelihoods(
     model: ModelParameters,
     normals: SurfaceNormals | None = None,
 ) -> np.ndarray:
-    """Those of many maps, shape (maps, cells), at once."""
+    """Log likelihoods of many maps at once, shape (maps, cells)."""
     model = of_cells(model, grid)
     mixture_weight = 1 - model.p_rand - model.p_lost
     total = np.zeros(len(maps))
@@ -339,7 +341,7 @@ def log_likelihoods(
 
 
 def box_sum(values: np.ndarray) -> np.ndarray:
-    """Sums over the 3 x 3 cells around each, as far as there are any."""
+    """Sums over the 3 x 3 cells around each cell, within the grid."""
     out = np.zeros_like(values)
     for row, column in np.ndindex(values.shape):
         out[row, column] = values[max(row - 1, 0) : row + 2, max(column - 1, 0) : column + 2].sum()
@@ -347,7 +349,7 @@ def box_sum(values: np.ndarray) -> np.ndarray:
 
 
 def normals(readings: Readings, grid: Grid, model: ModelParameters) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """C, S and M of `normals`, before they are summed over 3 x 3 cells."""
+    """C, S and M of `normals`, before the sums over 3 x 3 cells."""
     sums = np.zeros((3, *grid.shape))
     xs, ys = grid.centers()
     for t in range(len(readings)):
@@ -367,7 +369,7 @@ def normals(readings: Readings, grid: Grid, model: ModelParameters) -> tuple[np.
 def met(
     readings: Readings, grid: Grid, model: ModelParameters, normals: SurfaceNormals, limits: tuple[float, ...]
 ) -> np.ndarray:
-    """Echoes of each cell whose normal is known, and passes, by how far from it the cell is met: that of `incidence`.
+    """Echoes and passes of each cell with known normal, by the incidence at which it is met: twin of `incidence`.
 
     Shape (2, zones, cells).
     """
@@ -393,7 +395,7 @@ def met(
 
 
 def incidence_limit(echoes: np.ndarray, passes: np.ndarray) -> int:
-    """The zone with which a surface ends, by its echoes and passes in each zone: that of `incidence`."""
+    """The last zone in which a surface returns echoes, from echoes and passes in each zone: twin of `incidence`."""
 
     def rate(e: float, p: float) -> float:
         return (e + FEW_ECHOES) / (e + p + FEW_READINGS)
@@ -412,7 +414,7 @@ def incidence_limit(echoes: np.ndarray, passes: np.ndarray) -> int:
 
 
 def in_line_of_sight(grid: Grid, occupied: np.ndarray, apex: tuple[float, float], c: int, before: float) -> bool:
-    """Whether no occupied cell lies on the way from a sensor to `before` metres before cell c."""
+    """Whether no occupied cell is on the way from a sensor to `before` metres in front of cell c."""
     xs, ys = grid.centers()
     dx, dy = xs[c % grid.width] - apex[0], ys[c // grid.width] - apex[1]
     d = math.hypot(dx, dy)
@@ -426,7 +428,7 @@ def in_line_of_sight(grid: Grid, occupied: np.ndarray, apex: tuple[float, float]
 
 
 def explained_echoes(readings: Readings, grid: Grid, occupied: np.ndarray, model: ModelParameters) -> np.ndarray:
-    """Echoes that occupied cells explain, those on a free way and all, shape (2, cells): that of `free_ways`."""
+    """Echoes explained by occupied cells, with free path and all, shape (2, cells): the twin of `free_ways`."""
     out = np.zeros((2, grid.size))
     for t in np.flatnonzero(readings.z < readings.z_max):
         sigma = sigma_of(readings, t, grid, model)
@@ -442,7 +444,7 @@ def explained_echoes(readings: Readings, grid: Grid, occupied: np.ndarray, model
 def mirror_images(
     readings: Readings, grid: Grid, occupied: np.ndarray, model: ModelParameters, cells: np.ndarray
 ) -> np.ndarray:
-    """Which of some cells are mirror images, shape `grid.shape`: that of `free_ways`."""
+    """The cells among `cells` that are mirror images, shape `grid.shape`: the twin of `free_ways`."""
     free, total = explained_echoes(readings, grid, occupied, model).reshape(2, *grid.shape)
     out, n = np.zeros(grid.shape, bool), round(IMAGE_AROUND / grid.resolution)
     for row, column in np.argwhere(cells):
@@ -454,7 +456,7 @@ def mirror_images(
 def never_passed(
     readings: Readings, grid: Grid, occupied: np.ndarray, model: ModelParameters, cells: np.ndarray
 ) -> np.ndarray:
-    """Which of some cells no reading passed on a free way, shape `grid.shape`: that of `free_ways`."""
+    """The cells among `cells` that no reading passed on a free path, shape `grid.shape`: the twin of `free_ways`."""
     out = cells.copy()
     for t in range(len(readings)):
         sigma = sigma_of(readings, t, grid, model)
@@ -468,9 +470,9 @@ def never_passed(
 def passed(
     readings: Readings, grid: Grid, occupied: np.ndarray, model: ModelParameters, weight: np.ndarray | None = None
 ) -> np.ndarray:
-    """How many readings are expected to have passed each cell in each direction: that of `post_processing`.
+    """Expected number of readings that passed each cell in each direction: the twin of `post_processing`.
 
-    Shape (4, cells): of beams along 0°, 45°, 90° and 135°, whichever is nearest.
+    Shape (4, cells): beams nearest to 0°, 45°, 90° and 135°.
     """
     out, model = np.zeros((4, grid.size)), of_cells(model, grid)
     mixture_weight = 1 - model.p_rand - model.p_lost
@@ -490,7 +492,7 @@ def passed(
             before = sum(term for at, term in terms if at <= d)
             p = (whole - before) / total
             if d <= free_end and z < z_max:
-                # by chance it came through what lies in the free zone before the cell, if all of that let it
+                # the probability that it passed the occupied cells in the free zone in front of the cell
                 blocking = [at for at, _ in met if at <= free_end]
                 behind = bool(blocking) and d > min(blocking)
                 p += chance / total * ((1 - model.p_hit) ** len(blocking) if behind else 1.0)
@@ -503,7 +505,7 @@ def passed(
 
 
 def noticing(passes: np.ndarray, p_hit: float, max_incidence_angle: float) -> np.ndarray:
-    """As many readings that any surface would have noticed: of passes, shape (4, cells), by trying all bearings."""
+    """Expected number of passes that any surface would have noticed, shape (4, cells), by trying all bearings."""
     bearings = (np.arange(18000) + 0.5) * math.pi / 18000
     nearest = np.round(bearings / (math.pi / 4)).astype(int) % 4
     out = np.zeros(passes.shape[1])
@@ -527,7 +529,7 @@ def evidence(
 
 
 def calibrated(evidence: np.ndarray, passed: np.ndarray, ml: np.ndarray, alpha: float = 1.0) -> np.ndarray:
-    """The calibrated marginals of all cells, shape (height, width), cell by cell: the docstring of `uncertainty`."""
+    """Calibrated marginals of all cells, shape (height, width), cell by cell: see the docstring of `uncertainty`."""
     out = np.zeros(ml.shape)
     for row in range(ml.shape[0]):
         for column in range(ml.shape[1]):
@@ -551,8 +553,8 @@ def calibrated(evidence: np.ndarray, passed: np.ndarray, ml: np.ndarray, alpha: 
                 kind = -1.95
             else:
                 kind = -2.56 if sides and len(walls) >= 3 else -1.23
-            told = evidence[row, column]
-            logit = alpha * math.copysign(math.log(1 + abs(told)), told) + kind + (1.31 if ml[row, column] == 1 else 0)
+            nats = evidence[row, column]
+            logit = alpha * math.copysign(math.log(1 + abs(nats)), nats) + kind + (1.31 if ml[row, column] == 1 else 0)
             logit += -1.30 * math.log(1 + min(near)) + 0.29 * math.log(1 + sum(near) / 9)
             out[row, column] = 1 / (1 + math.exp(-logit))
     return out
@@ -561,8 +563,10 @@ def calibrated(evidence: np.ndarray, passed: np.ndarray, ml: np.ndarray, alpha: 
 STEPS = [(1, 0), (1, 1), (0, 1), (-1, 1), (-1, 0), (-1, -1), (0, -1), (1, -1)]
 
 
-def drawn_out(occupied: np.ndarray, told: np.ndarray, seen: np.ndarray, steps: int, barred: np.ndarray) -> np.ndarray:
-    """Cells of 0.1 m by which straight walls go on: the docstring of `extend`. `told`: (height, width), nats."""
+def extended_walls(
+    occupied: np.ndarray, nats: np.ndarray, seen: np.ndarray, steps: int, barred: np.ndarray
+) -> np.ndarray:
+    """Cells of 0.1 m by which straight walls are extended: see the docstring of `extend`. `nats`: (height, width)."""
     run, most = round(STRAIGHT_RUN / 0.1), MOST_AGAINST_EXTENSION * 0.1
     height, width = occupied.shape
     out = np.zeros(occupied.shape, np.uint8)
@@ -580,13 +584,13 @@ def drawn_out(occupied: np.ndarray, told: np.ndarray, seen: np.ndarray, steps: i
                 u, v = x + n * dx, y + n * dy
                 if not (0 <= u < width and 0 <= v < height):
                     break
-                if barred[v, u] or occupied[v, u] or not seen[v, u] or told[v, u] < -most:
+                if barred[v, u] or occupied[v, u] or not seen[v, u] or nats[v, u] < -most:
                     break
                 out[v, u] = 1
     return out
 
 
-def handed_out(
+def final_map(
     readings: Readings,
     grid: Grid,
     occupied: np.ndarray,
@@ -596,7 +600,7 @@ def handed_out(
     steps: int,
     least: tuple[float, float],
 ) -> np.ndarray:
-    """The map that is handed out, made of the one that the search found; `least`: passed, and noticed.
+    """The final map, made from the map found by the search; `least`: passed, and noticed.
 
     Cells are of 0.1 m.
     """
@@ -612,9 +616,9 @@ def handed_out(
     known = (ml == 0) & (traversed | (noticed & through))
     for _ in range(round(FREE_GROWTH / 0.1)):
         known = through & (box_sum(known.astype(int)) > 0)
-    told = evidence(readings, grid, occupied, model, normals).reshape(grid.shape)
-    told = np.where(occupied.reshape(grid.shape) == 1, -told, told)
-    ahead = drawn_out(occupied.reshape(grid.shape), told, seen, steps, through)
+    nats = evidence(readings, grid, occupied, model, normals).reshape(grid.shape)
+    nats = np.where(occupied.reshape(grid.shape) == 1, -nats, nats)
+    ahead = extended_walls(occupied.reshape(grid.shape), nats, seen, steps, through)
     ml[ahead == 1] = 1
     ml[(ml == 0) & (box_sum(known.astype(int)) == 0)] = -1
     images = mirror_images(readings, grid, occupied, model, ml == 1)

@@ -1,4 +1,4 @@
-"""Waits that end: what never comes fails a test instead of keeping it for ever."""
+"""Waits with a time limit, so that tests fail instead of waiting forever."""
 
 from __future__ import annotations
 
@@ -6,11 +6,11 @@ import subprocess
 import threading
 
 PATIENCE = 120.0
-"""Seconds; whatever a test waits for comes much sooner, also on a machine that has other work."""
+"""Seconds; all events that tests wait for come much sooner, also on a busy machine."""
 
 
 def line_of(process: subprocess.Popen[str]) -> str:
-    """Return the next line that a process prints; it is killed if none comes, which gives an empty one."""
+    """Return the next line that a process prints; without one, the process is killed and the line is empty."""
     assert process.stdout is not None
     killer = threading.Timer(PATIENCE, process.kill)
     killer.start()

@@ -1,4 +1,4 @@
-"""Models, searches and readings that tests of several rooms use."""
+"""Models, searches and readings that several folders of tests use."""
 
 from __future__ import annotations
 
@@ -21,16 +21,16 @@ PLAIN_MODEL: dict[str, Any] = {
     'surface_offset': 0.0,
     'likelihood_exponent': 1.0,
 }
-"""Every cone whole, obstacles at the centres of their cells, and independent readings."""
+"""Whole cones, obstacles at the centres of their cells, and independent readings."""
 
 PLAIN_SEARCH: dict[str, Any] = {
     'end_cost': 0.0,
     'least_passed': 0.0,
 }
-"""Independent cells, and nothing made of the map that the search found."""
+"""Independent cells, and no post-processing of the map found by the search."""
 
 PLAIN: dict[str, Any] = {**PLAIN_MODEL, **PLAIN_SEARCH}
-"""The model and the search of the paper, whatever the defaults are."""
+"""The model and the search of the paper, independent of the defaults."""
 
 
 def plain_model(**values: Any) -> ModelParameters:
@@ -42,14 +42,14 @@ def plain_search(**values: Any) -> SearchParameters:
 
 
 class FlipsAlone(Search):
-    """A search that shifts no cell."""
+    """A search without shifts."""
 
     def _shift(self, watch: object) -> int:
         return 0
 
 
 def random_readings(rng: np.random.Generator, grid: Grid, count: int, z_max: float = 0.0) -> Readings:
-    """Readings from random places of the grid in random directions, one in four without echo."""
+    """Readings from random places of the grid in random directions; one in four has no echo."""
     left, right, bottom, top = grid.extent
     z_max = z_max or 1.2 * max(right - left, top - bottom)
     z = rng.uniform(0.05, 1.0, count) * z_max
@@ -69,7 +69,7 @@ def random_readings(rng: np.random.Generator, grid: Grid, count: int, z_max: flo
 def associated(
     extrinsics: Mapping[str, Pose2], odometry: Iterable[OdometryMessage], ranges: Iterable[RangeMessage]
 ) -> PoseAssociator:
-    """What a recording of these messages gives, in the order of their stamps."""
+    """The associator after a recording of these messages, in the order of their stamps."""
     made = PoseAssociator(lambda base, frame, stamp: extrinsics.get(frame), Parameters(), patient=True)
     for message in sorted([*odometry, *ranges], key=lambda m: m.stamp):
         if isinstance(message, RangeMessage):

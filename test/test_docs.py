@@ -1,4 +1,4 @@
-"""Every name in README.md and docs/ exists: files, functions, parameters, commands, tests, topics, links."""
+"""All names in README.md and docs/ exist: files, functions, parameters, commands, tests, topics, links."""
 
 from __future__ import annotations
 
@@ -80,21 +80,21 @@ ALLOWED = {
     'bokeh': 'a package that Dask draws its dashboard with',
     'kill -9': 'a command of every shell',
 }
-"""Words in code spans that name nothing in the repository, and why they may stand there."""
+"""Words in code spans that are no names of the repository, with the reason why they are allowed."""
 
 PAGE_OR_PROGRAM = r'\b(?:docs|benchmarks|config|scripts)/\w+\.(?:md|py|yaml|xml|png)\b'
-"""A page, program or file of parameters as comments and help texts name it."""
+"""A page, program or parameter file in comments and help texts."""
 
 of_each_page = pytest.mark.parametrize('page', PAGES, ids=[str(page.relative_to(ROOT)) for page in PAGES])
 
 
-def test_the_readme_leads_to_every_page() -> None:
+def test_readme_links_to_all_pages() -> None:
     text = (ROOT / 'README.md').read_text(encoding='utf-8')
     assert [page.name for page in PAGES if page.parent.name == 'docs' and f'(docs/{page.name})' not in text] == []
     assert len(text.splitlines()) < 100, 'the rest belongs to docs/'
 
 
-def test_the_site_leads_to_every_page() -> None:
+def test_site_links_to_all_pages() -> None:
     def pages(items: list[Any]) -> Iterator[str]:
         for item in items:
             for entry in item.values() if isinstance(item, dict) else [item]:
@@ -108,27 +108,27 @@ def test_the_site_leads_to_every_page() -> None:
 
 
 @of_each_page
-def test_every_name_exists(page: Path) -> None:
+def test_all_names_exist(page: Path) -> None:
     assert wrong_names(page.read_text(encoding='utf-8'), page, ALLOWED) == []
 
 
 @of_each_page
-def test_every_command_line_would_run(page: Path) -> None:
+def test_all_command_lines_are_valid(page: Path) -> None:
     assert wrong_commands(page.read_text(encoding='utf-8'), page) == []
 
 
 @of_each_page
-def test_every_link_leads_somewhere(page: Path) -> None:
+def test_all_links_have_a_target(page: Path) -> None:
     assert wrong_links(page.read_text(encoding='utf-8'), page) == []
 
 
 @of_each_page
-def test_defaults_are_those_of_the_table(page: Path) -> None:
+def test_stated_defaults_are_those_of_the_table(page: Path) -> None:
     assert wrong_defaults(page.read_text(encoding='utf-8')) == []
 
 
 @of_each_page
-def test_no_figure_is_left_to_fill_in(page: Path) -> None:
+def test_pages_have_no_placeholders(page: Path) -> None:
     assert re.findall(r'@[A-Z]+@|\b(?:BYTES|TODO|TBD|FIXME|XXX)\b', page.read_text(encoding='utf-8')) == []
 
 
@@ -142,7 +142,7 @@ def test_paths_in_sources_exist() -> None:
     assert wrong == []
 
 
-def test_a_page_lists_all_packages_and_the_layers_of_the_core_in_their_order() -> None:
+def test_architecture_lists_all_packages_and_layers_in_order() -> None:
     text = (ROOT / 'docs' / 'architecture.md').read_text(encoding='utf-8')
     assert ' ← '.join(CORE) in text
     listed = dict(re.findall(r'^    (\w+)/ +\S.*?(?:← (.*))?$', text, flags=re.MULTILINE))
@@ -150,12 +150,12 @@ def test_a_page_lists_all_packages_and_the_layers_of_the_core_in_their_order() -
     assert below == {**BELOW, 'commands': {'all of them'}}
 
 
-def test_words_that_name_nothing_are_still_in_use() -> None:
+def test_allowed_words_are_in_use() -> None:
     pages = '\n'.join(page.read_text(encoding='utf-8') for page in PAGES)
     assert [word for word in ALLOWED if f'`{word}`' not in pages] == []
 
 
-# The tests above can fail: each of these has one wrong name
+# The tests above can fail: each of these texts has one wrong name
 
 PAGE = ROOT / 'docs' / 'planted.md'
 GOOD = """# A page
@@ -173,7 +173,7 @@ def wrong(text: str) -> list[str]:
     return [*wrong_names(text, PAGE, {}), *wrong_commands(text, PAGE), *wrong_links(text, PAGE), *wrong_defaults(text)]
 
 
-def test_a_page_of_good_names_has_no_wrong_one() -> None:
+def test_page_of_good_names_has_no_wrong_one() -> None:
     assert wrong(GOOD) == []
 
 
@@ -207,13 +207,13 @@ def test_a_page_of_good_names_has_no_wrong_one() -> None:
         ('# A page\n', '# A page\n\nIn core/finishing.py it is so.\n'),
     ],
 )
-def test_a_wrong_name_is_found(good: str, bad: str) -> None:
+def test_wrong_name_is_found(good: str, bad: str) -> None:
     assert good in GOOD
     assert wrong(GOOD.replace(good, bad)) != []
 
 
 @pytest.mark.skipif(not DEPRECATED, reason='no parameter has a former name')
-def test_a_former_name_must_be_called_so() -> None:
+def test_former_name_must_be_marked() -> None:
     name = sorted(DEPRECATED)[0]
     assert wrong(f'Set `{name}`.\n') == [f'{name} is deprecated']
     assert wrong(f'Set `{name}`, which is deprecated.\n') == []

@@ -1,4 +1,4 @@
-"""The launch file, with stand-ins for `launch` and `launch_ros` where they are not installed."""
+"""The launch file, with stand-ins for `launch` and `launch_ros` if they are not installed."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ MODULES = {
 
 
 class Call:
-    """What a class of launch was called with."""
+    """The arguments of a call of a class of launch."""
 
     def __init__(self, *arguments: Any, **options: Any) -> None:
         self.arguments = arguments
@@ -41,11 +41,11 @@ class Call:
         return type(self).__name__
 
     def perform(self, context: dict[str, str]) -> str:
-        """The text of a substitution; here the context is the values of the launch arguments."""
+        """The text of a substitution; the context here is the values of the launch arguments."""
         return str(self.resolve(context))
 
     def resolve(self, values: dict[str, str]) -> Any:
-        """The value of a substitution when the launch arguments have these values."""
+        """The value of a substitution for these values of the launch arguments."""
         if self.kind == 'LaunchConfiguration':
             return values[self.arguments[0]]
         if self.kind == 'PathJoinSubstitution':
@@ -62,7 +62,7 @@ class Call:
 
 
 def resolved(value: Any, values: dict[str, str]) -> Any:
-    """`value` with all substitutions carried out."""
+    """`value` with all substitutions resolved."""
     if isinstance(value, Call):
         return value.resolve(values)
     if isinstance(value, dict):
@@ -74,7 +74,7 @@ def resolved(value: Any, values: dict[str, str]) -> Any:
 
 @pytest.fixture
 def description() -> Iterator[list[Call]]:
-    """What the launch file describes."""
+    """The launch description of the file."""
     with pytest.MonkeyPatch.context() as patch:
         for name, kinds in MODULES.items():
             module = ModuleType(name)
@@ -85,7 +85,7 @@ def description() -> Iterator[list[Call]]:
 
 
 def started(description: list[Call], **given: str) -> list[dict[str, Any]]:
-    """Options of the nodes that would start, in their order."""
+    """Options of the nodes that would start, in order."""
     values: dict[str, str] = {}
     for call in description:
         if call.kind == 'DeclareLaunchArgument':
@@ -99,23 +99,23 @@ def started(description: list[Call], **given: str) -> list[dict[str, Any]]:
 
 
 def launched(description: list[Call], **given: str) -> dict[str, dict[str, Any]]:
-    """The same by executable."""
+    """Options of the nodes that would start, by executable."""
     return {node['executable']: node for node in started(description, **given)}
 
 
-def test_by_default_it_starts_the_node_alone(description: list[Call]) -> None:
+def test_default_launch_starts_only_the_node(description: list[Call]) -> None:
     nodes = launched(description)
     assert set(nodes) == {'mapper'}
     node = nodes['mapper']
     assert (node['package'], node['name'], node['namespace']) == ('forward_grid_mapper', 'forward_grid_mapper', '')
-    # nothing that would override the file, or what SetParameter says
+    # no parameters that would override the file or SetParameter
     (file,) = node['parameters']
     assert load_parameters(ROOT / file.removeprefix('share/forward_grid_mapper/')).values
     assert node['arguments'] == ['--ros-args', '--log-level', 'info']
     assert node['respawn'] is False
 
 
-def test_every_argument_tells_what_it_is_for(description: list[Call]) -> None:
+def test_all_arguments_have_a_description(description: list[Call]) -> None:
     arguments = [call for call in description if call.kind == 'DeclareLaunchArgument']
     assert {'namespace', 'params_file', 'use_sim_time', 'rviz', 'log_level'} <= {
         call.arguments[0] for call in arguments
@@ -123,7 +123,7 @@ def test_every_argument_tells_what_it_is_for(description: list[Call]) -> None:
     assert all(call.options['description'] for call in arguments)
 
 
-def test_arguments_reach_the_node(description: list[Call]) -> None:
+def test_arguments_are_passed_to_the_node(description: list[Call]) -> None:
     given = {
         'params_file': '/my.yaml',
         'use_sim_time': 'true',
@@ -138,7 +138,7 @@ def test_arguments_reach_the_node(description: list[Call]) -> None:
     assert node['arguments'][-1] == 'debug'
 
 
-def test_a_namespace_moves_what_rviz_listens_to_with_the_node(description: list[Call]) -> None:
+def test_topics_of_rviz_follow_the_namespace(description: list[Call]) -> None:
     nodes = launched(description, rviz='true', namespace='robot', odom='wheels')
     node, rviz = nodes['mapper'], nodes['rviz2']
     assert node['namespace'] == rviz['namespace'] == 'robot'
@@ -155,7 +155,7 @@ def test_a_namespace_moves_what_rviz_listens_to_with_the_node(description: list[
     assert renamed['/odom'] == 'wheels'
 
 
-def test_parameters_that_are_launch_arguments_reach_the_node_with_their_types(description: list[Call]) -> None:
+def test_parameters_as_launch_arguments_keep_their_types(description: list[Call]) -> None:
     given = {
         'range_topics': 'left, right,',
         'range_reliability': 'reliable',
@@ -163,7 +163,7 @@ def test_parameters_that_are_launch_arguments_reach_the_node_with_their_types(de
         'map_frame': 'map',
         'online': 'true',
         'autostart': 'false',
-        # a text, though YAML takes it for nothing
+        # a string, although YAML reads it as null
         'journal': '~',
     }
     _, chosen = launched(description, **given)['mapper']['parameters']
@@ -174,7 +174,7 @@ def test_parameters_that_are_launch_arguments_reach_the_node_with_their_types(de
     assert alone == {'online': False}
 
 
-def test_what_the_launch_file_offers_of_the_table_has_the_choices_of_the_table(description: list[Call]) -> None:
+def test_launch_arguments_have_the_choices_of_the_table(description: list[Call]) -> None:
     declared = {call.arguments[0]: call.options for call in description if call.kind == 'DeclareLaunchArgument'}
     for row in TABLE:
         if row.name in declared and row.choices:
@@ -182,45 +182,45 @@ def test_what_the_launch_file_offers_of_the_table_has_the_choices_of_the_table(d
             assert declared[row.name]['default_value'] == ''
 
 
-def test_one_of_the_maps_goes_where_nav2_expects_it(description: list[Call]) -> None:
+def test_chosen_map_is_remapped_for_nav2(description: list[Call]) -> None:
     nodes = launched(description, map='ml_map', rviz='true')
     assert [pair for pair in nodes['mapper']['remappings'] if pair[1] == 'map'] == [('~/ml_map', 'map')]
     renamed = dict(nodes['rviz2']['remappings'])
     assert renamed['/forward_grid_mapper/ml_map'] == 'map'
-    # the mapper names them after the map's own topic
+    # the mapper names the updates after the topic of the map
     assert renamed['/forward_grid_mapper/ml_map_updates'] == 'map_updates'
     assert renamed['/forward_grid_mapper/live_map'] == 'forward_grid_mapper/live_map'
     assert not [pair for pair in launched(description)['mapper']['remappings'] if pair[1] == 'map']
 
 
 @pytest.mark.parametrize('chosen', ['', 'ml_map', 'live_map', 'uncertainty_map'])
-def test_a_map_of_probabilities_says_what_nav2_needs(description: list[Call], chosen: str) -> None:
+def test_map_of_probabilities_logs_the_settings_for_nav2(description: list[Call], chosen: str) -> None:
     values = {call.arguments[0]: '' for call in description if call.kind == 'DeclareLaunchArgument'} | {'map': chosen}
     (opaque,) = (call for call in description if call.kind == 'OpaqueFunction')
-    said = [call.options['msg'] for call in opaque.options['function'](values) if call.kind == 'LogInfo']
-    assert len(said) == (chosen in ('live_map', 'uncertainty_map'))
-    assert all('lethal_cost_threshold: 65' in text for text in said)
+    messages = [call.options['msg'] for call in opaque.options['function'](values) if call.kind == 'LogInfo']
+    assert len(messages) == (chosen in ('live_map', 'uncertainty_map'))
+    assert all('lethal_cost_threshold: 65' in text for text in messages)
 
 
 @pytest.mark.parametrize('written', ['true', 'True'])
-def test_switches_are_taken_as_python_writes_them(description: list[Call], written: str) -> None:
+def test_switches_accept_the_spelling_of_python(description: list[Call], written: str) -> None:
     nodes = launched(description, use_sim_time=written, online=written, rviz=written, use_respawn=written)
     assert nodes['mapper']['parameters'][1:] == [{'use_sim_time': True}, {'online': True}]
     assert nodes['rviz2']['parameters'] == [{'use_sim_time': True}]
     assert nodes['mapper']['respawn'] is True
 
 
-def test_the_mapper_is_started_again_on_request(description: list[Call]) -> None:
+def test_mapper_is_respawned_on_request(description: list[Call]) -> None:
     node = launched(description, use_respawn='true')['mapper']
     assert node['respawn'] is True
     assert node['respawn_delay'] > 0
 
 
-def test_rviz_comes_first_so_that_its_absence_leaves_no_mapper_behind(description: list[Call]) -> None:
+def test_rviz_starts_first_so_that_its_absence_leaves_no_mapper(description: list[Call]) -> None:
     assert [node['executable'] for node in started(description, rviz='true')] == ['rviz2', 'mapper']
 
 
-def test_launch_itself_takes_the_file() -> None:
+def test_launch_accepts_the_file() -> None:
     pytest.importorskip('launch_ros', reason='launch_ros is not installed (a sourced ROS 2)')
     made = runpy.run_path(str(FILE))['generate_launch_description']()
     names = {argument.name for argument in made.get_launch_arguments()}

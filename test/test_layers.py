@@ -1,4 +1,4 @@
-"""Layers: each imports only from those below it, no two modules import each other, and the core needs little."""
+"""Layers: each imports only from those below, no two modules import each other, and the core has few dependencies."""
 
 from __future__ import annotations
 
@@ -21,10 +21,10 @@ BELOW = {
     'node': {'core', 'files'},
     'commands': {'core', 'files', 'bags', 'simulation', 'recordings', 'replay', 'node', 'scale'},
 }
-"""The packages that each package may import from, beside itself."""
+"""The packages that each package may import from, in addition to itself."""
 
 CORE = ('common', 'runtime', 'sensor', 'messages', 'evidence', 'search', 'maps', 'tiles', 'learning', 'trajectory')
-"""The layers of the core, from the bottom up; the modules beside them are above all."""
+"""The layers of the core, from the bottom up; modules outside them are above all layers."""
 
 OUTSIDE = {
     'core': {'numpy', 'numba', 'scipy'},
@@ -35,13 +35,13 @@ OUTSIDE = {
     'recordings': {'numpy'},
     'scale': {'numpy', 'numba', 'dask', 'distributed', 'pyarrow', 'zarr'},
 }
-"""What is imported from outside of the standard library; where nothing is named, anything may be."""
+"""Imports from outside the standard library; without an entry, anything is allowed."""
 
 MODULES = {'.'.join(path.relative_to(PACKAGE.parent).with_suffix('').parts): path for path in PACKAGE.rglob('*.py')}
 
 
 def imports(module: str) -> set[str]:
-    """Absolute names of everything that a module imports, at any depth: modules, and names in them."""
+    """Absolute names of all imports of a module, at any depth: modules, and names in them."""
     names = set()
     parts = module.split('.')
     for node in ast.walk(ast.parse(MODULES[module].read_text())):
@@ -78,7 +78,7 @@ def test_packages_import_only_from_below(package: str) -> None:
                 assert parts[0] in OUTSIDE[package], f'{module} imports {name}'
 
 
-def test_every_package_and_layer_is_listed() -> None:
+def test_all_packages_and_layers_are_listed() -> None:
     folders = {path.parent.relative_to(PACKAGE).parts for path in MODULES.values()}
     assert {parts[0] for parts in folders if parts} == set(BELOW)
     assert {parts[1] for parts in folders if parts[:1] == ('core',) and len(parts) > 1} == set(CORE)
@@ -103,6 +103,6 @@ def test_no_modules_import_each_other() -> None:
             del left[module]
 
 
-def test_tests_of_the_core_stand_where_its_modules_do() -> None:
+def test_folders_of_core_tests_are_those_of_the_core() -> None:
     folder = Path(__file__).parent / 'core'
     assert {path.name for path in folder.iterdir() if path.is_dir() and path.name[0] != '_'} <= set(CORE)

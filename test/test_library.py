@@ -1,4 +1,4 @@
-"""The library: arrays in, the maps of the node and of the bags out, and errors in words."""
+"""The library: maps from arrays are those of the node and of bags, and errors have clear messages."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ def expected() -> Any:
 
 
 @pytest.mark.parametrize('shuffled', [False, True])
-def test_arrays_give_the_maps_of_the_messages(shuffled: bool) -> None:
+def test_arrays_give_the_maps_of_messages(shuffled: bool) -> None:
     arrays, maps = given(), expected()
     if shuffled:
         for names in (('pose_stamps', 'poses'), ('range_stamps', 'ranges', 'sensor_of')):
@@ -66,7 +66,7 @@ def test_arrays_give_the_maps_of_the_messages(shuffled: bool) -> None:
     assert np.array_equal(found.maps.uncertainty, maps.uncertainty, equal_nan=True)
 
 
-def test_ranges_are_taken_as_rep_117_has_them() -> None:
+def test_ranges_follow_rep_117() -> None:
     arrays = given()
     arrays['ranges'][:4] = [math.nan, -1.0, math.inf, 1e9]
     found = make_maps(**arrays)
@@ -74,7 +74,7 @@ def test_ranges_are_taken_as_rep_117_has_them() -> None:
     assert found.received == len(found.maps.readings) + sum(found.rejected.values())
 
 
-def test_results_are_saved_with_their_counts(tmp_path: Path) -> None:
+def test_results_are_saved_with_counts(tmp_path: Path) -> None:
     arrays = given()
     arrays['ranges'][0] = math.nan
     report = make_maps(**arrays).save(tmp_path / 'maps')
@@ -82,29 +82,29 @@ def test_results_are_saved_with_their_counts(tmp_path: Path) -> None:
     assert {path.name for path in (tmp_path / 'maps').iterdir()} >= {'ml_map.pgm', 'maps.npz', 'report.txt'}
 
 
-def test_a_folder_that_is_taken_is_named_without_options_of_commands(tmp_path: Path) -> None:
+def test_existing_folder_is_rejected_without_naming_options(tmp_path: Path) -> None:
     (tmp_path / 'mine.txt').write_text('mine')
     found = make_maps(**given())
     for taken in (tmp_path, tmp_path / 'mine.txt'):
-        with pytest.raises(OutputError, match=r'choose another\b') as told:
+        with pytest.raises(OutputError, match=r'choose another\b') as caught:
             found.save(taken)
-        assert str(told.value).startswith(str(taken)) and '-o' not in str(told.value).replace(str(taken), '')
+        assert str(caught.value).startswith(str(taken)) and '-o' not in str(caught.value).replace(str(taken), '')
     assert [path.name for path in tmp_path.iterdir()] == ['mine.txt']
 
 
-def test_what_is_wrong_without_an_error_is_a_warning() -> None:
+def test_ranges_in_millimetres_give_a_warning() -> None:
     arrays = given()
     arrays['sensors'] = {
         name: Sonar(s.x, s.y, s.yaw, s.field_of_view, s.max_range * 1000) for name, s in arrays['sensors'].items()
     }
     arrays['ranges'] = [1000 * z for z in arrays['ranges']]
-    # a few: a map of kilometres takes long
+    # only a few readings: a map of kilometres takes long
     for name in ('range_stamps', 'ranges', 'sensor_of'):
         arrays[name] = arrays[name][::4]
     assert any('mm' in warning or 'millimetre' in warning for warning in make_maps(**arrays).warnings)
 
 
-def test_readings_that_max_readings_leaves_out_are_told_of() -> None:
+def test_readings_above_max_readings_give_a_warning() -> None:
     arrays = given()
     whole = make_maps(**arrays)
     most = len(whole.maps.readings) // 2
@@ -112,11 +112,11 @@ def test_readings_that_max_readings_leaves_out_are_told_of() -> None:
     assert len(part.maps.readings) <= most
     assert any('max_readings' in warning for warning in part.warnings)
     assert not any('max_readings' in warning for warning in whole.warnings)
-    # the live map has all of them
+    # the live map has all readings
     assert np.array_equal(part.maps.live, whole.maps.live, equal_nan=True)
 
 
-def test_the_report_warns_of_what_the_result_warns_of(tmp_path: Path) -> None:
+def test_report_has_the_warnings_of_the_result(tmp_path: Path) -> None:
     arrays = given()
     poses = np.array(arrays['poses'])
     poses[len(poses) // 2 :, 0] = 1e8
@@ -128,11 +128,11 @@ def test_the_report_warns_of_what_the_result_warns_of(tmp_path: Path) -> None:
         make_maps(**{**arrays, 'poses': poses * [0, 0, 0] + [1e8, 0, 0]})
 
 
-def test_poses_of_sensors_are_compared_with_the_readings_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    asked: list[Any] = []
+def test_sensor_poses_are_checked_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    checked: list[Any] = []
 
     def turned(maps: Any, source: Any) -> list[str]:
-        asked.append(source['extrinsics'])
+        checked.append(source['extrinsics'])
         return ['sensors are turned']
 
     monkeypatch.setattr(library, 'data_warnings', turned)
@@ -140,11 +140,11 @@ def test_poses_of_sensors_are_compared_with_the_readings_once(tmp_path: Path, mo
     found = make_maps(**arrays)
     assert 'sensors are turned' in found.warnings
     assert 'sensors are turned' in found.save(tmp_path / 'maps')['warnings']
-    assert asked == [{name: (s.x, s.y, s.yaw) for name, s in arrays['sensors'].items()}]
+    assert checked == [{name: (s.x, s.y, s.yaw) for name, s in arrays['sensors'].items()}]
 
 
 class Column:
-    """A column of a table, as of pandas, which is an array but no sequence."""
+    """A column of a table like in pandas, which is an array but no sequence."""
 
     def __init__(self, values: list[str]) -> None:
         self._values = values
@@ -153,7 +153,7 @@ class Column:
         return np.array(self._values, dtype or object)
 
 
-def test_names_of_sensors_may_be_a_column_of_a_table() -> None:
+def test_sensor_names_may_be_a_column_of_a_table() -> None:
     arrays = given()
     names = arrays.pop('sensor_of')
     np.testing.assert_array_equal(make_maps(**arrays, sensor_of=Column(names)).maps.ml, expected().ml)
@@ -161,13 +161,13 @@ def test_names_of_sensors_may_be_a_column_of_a_table() -> None:
         make_maps(**arrays, sensor_of=np.array('sonar'))
 
 
-def test_numpy_scalars_are_numbers() -> None:
+def test_parameters_may_be_numpy_scalars() -> None:
     chosen = {'resolution': np.float64(0.2), 'max_iterations': np.int64(50), 'p_hit': np.float32(0.5)}
     assert make_maps(**given(), parameters=chosen).maps.grid.resolution == 0.2
 
 
 @pytest.mark.parametrize(
-    ('change', 'said'),
+    ('change', 'message'),
     [
         ({'sensors': [Sonar(0.0, 0.0, 0.0, 0.5, 3.0)]}, 'sensors must be a mapping'),
         ({'sensors': {'f': (0, 0, 0, 0.5, 3)}}, 'sensors must be a mapping'),
@@ -199,27 +199,27 @@ def test_numpy_scalars_are_numbers() -> None:
         ({'poses': np.zeros((3, 3), 'm8[s]')}, 'poses must be numbers, not of the type timedelta64[s]'),
     ],
 )
-def test_arrays_that_make_no_sense_are_named(change: dict[str, Any], said: str) -> None:
-    with pytest.raises(InputError, match=re.escape(said)):
+def test_bad_array_is_rejected_with_reason(change: dict[str, Any], message: str) -> None:
+    with pytest.raises(InputError, match=re.escape(message)):
         make_maps(**{**given(), **change})
 
 
 @pytest.mark.parametrize('unit', ['M8[ns]', 'M8[us]', 'm8[ns]', 'm8[ms]'])
-def test_times_of_numpy_are_stamps(unit: str) -> None:
+def test_numpy_times_are_converted_to_stamps(unit: str) -> None:
     given_ms = np.array([1_700_000_000_123, 1_700_000_000_250, -5])
     times = (np.array(0, 'M8[ms]') + given_ms.astype('m8[ms]')).astype(unit) if unit[0] == 'M' else None
     exact = arrays.stamps('t', given_ms.astype('m8[ms]').astype(unit) if times is None else times)
     assert exact.tolist() == (given_ms * 1_000_000).tolist()
 
 
-def test_stamps_that_are_fine_enough_may_have_any_type() -> None:
+def test_stamps_of_any_type_are_accepted_if_precise() -> None:
     assert arrays.stamps('t', np.array([0.5, 100.25], np.float32)).tolist() == [500_000_000, 100_250_000_000]
     assert arrays.stamps('t', [1, 2]).tolist() == [1_000_000_000, 2_000_000_000]
     assert arrays.column('ranges', np.ma.array([1.0, 2.0], mask=[0, 0])).tolist() == [1.0, 2.0]
     assert arrays.stamps('t', np.array([], np.float32)).tolist() == []
 
 
-def test_two_poses_of_one_stamp_are_told() -> None:
+def test_two_poses_with_one_stamp_give_a_warning() -> None:
     twice = given()
     stamps, poses = np.repeat(twice['pose_stamps'], 2), np.repeat(np.array(twice['poses']), 2, axis=0)
     same = make_maps(**{**twice, 'pose_stamps': stamps, 'poses': poses})
@@ -232,13 +232,13 @@ def test_two_poses_of_one_stamp_are_told() -> None:
     )
 
 
-def test_parameters_of_the_node_are_told_to_have_no_effect() -> None:
+def test_parameters_of_the_node_give_a_warning() -> None:
     found = make_maps(**given(), parameters={'refine_poses': True, 'journal': '/tmp/j', 'autostart': True})
-    (told,) = [text for text in found.warnings if 'ignored' in text]
-    assert 'refine_poses' in told and 'journal' in told and 'autostart' not in told
+    (warning,) = [text for text in found.warnings if 'ignored' in text]
+    assert 'refine_poses' in warning and 'journal' in warning and 'autostart' not in warning
 
 
-def test_units_are_checked() -> None:
+def test_values_in_wrong_units_are_rejected() -> None:
     arrays = given()
     with pytest.raises(InputError, match='must be divided by 1e9'):
         make_maps(**{**arrays, 'range_stamps': np.array(arrays['range_stamps']) * 1e9 + 1.7e18})
@@ -264,14 +264,14 @@ def test_units_are_checked() -> None:
         make_maps(**arrays, parameters={'p_hti': 0.5})
 
 
-def test_stamps_that_do_not_overlap_are_shown() -> None:
+def test_stamps_that_do_not_overlap_are_reported() -> None:
     arrays = given()
     late = np.array(arrays['range_stamps']) + 1e6
     with pytest.raises(InputError, match=r'none of .* after_odometry .*poses span'):
         make_maps(**{**arrays, 'range_stamps': late})
 
 
-def test_a_trajectory_of_tum_is_read(tmp_path: Path) -> None:
+def test_tum_trajectory_is_read(tmp_path: Path) -> None:
     path = tmp_path / 'poses.txt'
     half = math.sqrt(0.5)
     path.write_text(f'# stamp x y z qx qy qz qw\n\n1.5 2 3 0.1 0 0 0 1\n2.5 4 5 0.1 0 0 {half} {half}\n')
@@ -281,7 +281,7 @@ def test_a_trajectory_of_tum_is_read(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize('line', ['1 2 3', '1 2 3 4 5 6 7 x', '1 2 3 0 0 0 0 0', 'nan 2 3 0 0 0 0 1'])
-def test_a_line_that_is_no_pose_is_named(tmp_path: Path, line: str) -> None:
+def test_bad_line_of_a_trajectory_is_reported(tmp_path: Path, line: str) -> None:
     path = tmp_path / 'poses.txt'
     path.write_text(f'1.5 2 3 0.1 0 0 0 1\n{line}\n')
     with pytest.raises(InputError, match=r'poses\.txt, line 2: '):
@@ -290,7 +290,7 @@ def test_a_line_that_is_no_pose_is_named(tmp_path: Path, line: str) -> None:
         poses_from_tum(tmp_path / 'absent.txt')
 
 
-def test_the_example_of_the_page_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_example_of_the_page_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (example,) = re.findall(r'```python\n(.*?)```', PAGE.read_text(encoding='utf-8'), re.DOTALL)
     monkeypatch.chdir(tmp_path)
     names: dict[str, Any] = {}
@@ -305,15 +305,15 @@ def test_the_example_of_the_page_runs(tmp_path: Path, monkeypatch: pytest.Monkey
     assert (tmp_path / 'corridor_maps' / 'ml_map.yaml').is_file()
 
 
-def test_importing_the_package_imports_no_kernel() -> None:
+def test_import_of_the_package_does_not_import_numba() -> None:
     code = 'import sys, forward_grid_mapper; sys.exit("numba" in sys.modules)'
     assert subprocess.run([sys.executable, '-c', code], check=False).returncode == 0
     with pytest.raises(AttributeError, match='make_map'):
         forward_grid_mapper.make_map  # noqa: B018
 
 
-def test_what_an_inclined_sensor_measures_is_that_of_a_level_one_in_the_plane() -> None:
-    """The ranges along the inclined axis, and the cone whose shadow is the level one's."""
+def test_inclined_sensor_gives_the_maps_of_a_level_one() -> None:
+    """Ranges along the inclined axis, and a cone whose projection is that of the level sensor."""
     arrays, pitch = given(), 0.5
     level = make_maps(**arrays)
     along = 1.0 / math.cos(pitch)
@@ -342,7 +342,7 @@ def test_one_dead_sensor_of_many_is_named() -> None:
     ]
 
 
-def test_steep_sensors_are_rejected_in_words() -> None:
+def test_steep_sensors_are_rejected_with_reason() -> None:
     arrays = given()
     name, sensor = next(iter(arrays['sensors'].items()))
     steep = Sonar(sensor.x, sensor.y, sensor.yaw, sensor.field_of_view, sensor.max_range, sensor.min_range, -1.5)
@@ -358,14 +358,12 @@ def test_steep_sensors_are_rejected_in_words() -> None:
     ('degrees', 'speed', 'width'), [(30, 0.25, 0.9), (15, 0.25, 0.7), (15, 0.25, 0.9), (30, 0.1, 0.9), (30, 0.25, 1.2)]
 )
 @pytest.mark.parametrize('seed', range(3))
-def test_a_door_that_readings_without_echo_alone_show_is_open(
-    degrees: float, speed: float, width: float, seed: int
-) -> None:
-    """A sonar of 3 m hears nothing through an open door to a hall: some twenty such readings must do."""
+def test_door_seen_only_by_readings_without_echo_is_open(degrees: float, speed: float, width: float, seed: int) -> None:
+    """A sonar of 3 m range has no echo through an open door to a hall; about twenty such readings must suffice."""
     t = np.arange(0.0, 5.0 / speed, 0.1)
     x = speed * t
     ahead = np.where(6.0 - x - 0.1 < 3.0, 6.0 - x - 0.1, math.inf)
-    # a cone meets the jambs until it fits the opening
+    # a cone sees the jambs until it fits into the opening
     fits = abs(x - 2.85) < width / 2 - 0.9 * math.tan(math.radians(degrees / 2))
     left, right = np.where(fits, math.inf, 0.9), np.full_like(x, 0.9)
     cone = {'field_of_view': math.radians(degrees), 'max_range': 3.0}

@@ -1,4 +1,4 @@
-"""The notebook runs from its first cell to its last, and its map shows what its text says."""
+"""The notebook runs from the first to the last cell, and its map agrees with its text."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import pytest
 NOTEBOOK = Path(__file__).resolve().parents[1] / 'docs' / 'first_map.ipynb'
 
 
-def test_its_cells_run_one_after_the_other(
+def test_all_cells_of_the_notebook_run(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     pytest.importorskip('matplotlib')
@@ -23,8 +23,8 @@ def test_its_cells_run_one_after_the_other(
         if cell['cell_type'] == 'code':
             assert not cell['outputs'], 'outputs are not kept: they would grow stale'
             exec(compile(''.join(cell['source']), cell['id'], 'exec'), names)
-    said = capsys.readouterr().out
-    assert '600 ranges, rejected: {}' in said
+    output = capsys.readouterr().out
+    assert '600 ranges, rejected: {}' in output
     assert names['probability'](2.85, 1.0) < 0.1
     assert names['probability'](1.5, 1.0) > 0.6
-    assert 'report.html' in said.splitlines()
+    assert 'report.html' in output.splitlines()

@@ -1,4 +1,4 @@
-"""Orientations become headings in one way: odometry's, those of a bag's static transforms, and TF's in the node."""
+"""Headings from orientations: the same for odometry, static transforms of bags, and TF in the node."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ Convert = Callable[..., Pose2 | None]
 
 
 def turned(yaw: float, pitch: float, scale: float = 1.0) -> XYZW:
-    """First turned by yaw, then by pitch; `scale` is the quaternion's length."""
+    """A rotation by yaw, and then by pitch; `scale` is the length of the quaternion."""
     a, b = yaw / 2, pitch / 2
     x, y, z, w = (
         -math.sin(a) * math.sin(b),
@@ -66,7 +66,7 @@ def turned(yaw: float, pitch: float, scale: float = 1.0) -> XYZW:
 @pytest.mark.parametrize('scale', [0.9951, 1.0, 1.0049])
 @pytest.mark.parametrize('pitch', [0.0, 0.7, math.radians(59.9), -math.radians(59.9)])
 @pytest.mark.parametrize('yaw', [-3.0, 0.0, 2.5])
-def test_an_orientation_is_projected_whatever_its_last_digits(
+def test_orientation_of_nearly_unit_length_is_projected(
     convert: Convert, yaw: float, pitch: float, scale: float
 ) -> None:
     assert convert(turned(yaw, pitch, scale)) == pytest.approx((1.0, 2.0, yaw))
@@ -74,30 +74,30 @@ def test_an_orientation_is_projected_whatever_its_last_digits(
 
 @everywhere
 @pytest.mark.parametrize('scale', [0.0, 0.98, 0.994, 1.006, 1.02, 2.0, math.nan, math.inf])
-def test_a_quaternion_that_tf2_refuses_is_refused(convert: Convert, scale: float) -> None:
+def test_quaternion_that_tf2_rejects_is_rejected(convert: Convert, scale: float) -> None:
     assert convert(turned(0.5, 0.0, scale)) is None
 
 
 @everywhere
 @pytest.mark.parametrize('scale', [0.9951, 1.0, 1.0049])
 @pytest.mark.parametrize('pitch', [math.radians(60.1), -math.radians(60.1), math.pi / 2])
-def test_an_axis_out_of_the_plane_has_no_heading(convert: Convert, pitch: float, scale: float) -> None:
+def test_steep_axis_has_no_heading(convert: Convert, pitch: float, scale: float) -> None:
     assert convert(turned(0.5, pitch, scale)) is None
 
 
 @everywhere
 @pytest.mark.parametrize('x', [math.nan, math.inf])
-def test_a_position_that_is_not_finite_is_refused(convert: Convert, x: float) -> None:
+def test_position_that_is_not_finite_is_rejected(convert: Convert, x: float) -> None:
     assert convert(turned(0.5, 0.0), x) is None
 
 
 @everywhere
-def test_a_frame_upside_down_turns_the_other_way(convert: Convert) -> None:
+def test_yaw_of_an_upside_down_frame_is_mirrored(convert: Convert) -> None:
     assert convert((math.cos(0.25), math.sin(0.25), 0.0, 0.0)) == pytest.approx((1.0, 2.0, 0.5))
 
 
 @pytest.mark.parametrize('pitch', [0.0, 0.5, -0.9])
-def test_bag_and_tf_see_the_same_elevation(pitch: float) -> None:
+def test_bag_and_tf_give_the_same_elevation(pitch: float) -> None:
     found = by_bag(turned(0.5, pitch)), by_tf(turned(0.5, pitch))
     for mount in found:
         assert isinstance(mount, Mount)

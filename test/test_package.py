@@ -1,4 +1,4 @@
-"""What installs the package, and the files that come with it: they agree with each other and with the code."""
+"""Installation files and data files: they agree with each other and with the code."""
 
 from __future__ import annotations
 
@@ -37,10 +37,10 @@ DEPENDENCIES = {
         *('python3-pytest', 'python3-pytest-timeout', 'python3-pytest-xdist'),
     },
 }
-"""Names of ROS packages, and keys of rosdep for the rest."""
+"""Names of ROS packages, and keys of rosdep for other packages."""
 
 IMPORTS = {'python3-yaml': 'PyYAML', 'python3-rosbags-pip': 'rosbags', 'python3-pil': 'pillow'}
-"""The names of those keys on the Python side, where they differ by more than the prefix."""
+"""Python names of these keys, if they differ by more than the prefix."""
 
 MAPS = [f'/{NAME}/{name}' for name in ('live_map', 'ml_map', 'uncertainty_map')]
 
@@ -51,7 +51,7 @@ def manifest() -> ElementTree.Element:
 
 
 def given_to_setuptools(*arguments: str) -> dict[str, Any]:
-    """What setup.py hands to setuptools when it is called with these arguments."""
+    """The arguments of setup.py for setuptools when it is called with these arguments."""
     given: dict[str, Any] = {}
     with pytest.MonkeyPatch.context() as patch:
         patch.chdir(ROOT)
@@ -63,7 +63,7 @@ def given_to_setuptools(*arguments: str) -> dict[str, Any]:
 
 @pytest.fixture(scope='module')
 def setup() -> dict[str, Any]:
-    """What setup.py hands to setuptools when colcon builds."""
+    """The arguments of setup.py for setuptools when colcon builds."""
     return given_to_setuptools('install', '--prefix', 'install')
 
 
@@ -71,12 +71,12 @@ def text_of(manifest: ElementTree.Element, tag: str) -> str:
     return (manifest.findtext(tag) or '').strip()
 
 
-def test_the_manifest_is_valid() -> None:
+def test_manifest_is_valid() -> None:
     package = pytest.importorskip('catkin_pkg.package', reason='catkin_pkg is not installed')
     assert package.parse_package(str(ROOT / 'package.xml'), warnings=[]).validate() is None
 
 
-def test_the_manifest_names_what_colcon_and_rosdep_need(manifest: ElementTree.Element) -> None:
+def test_manifest_has_the_entries_of_colcon_and_rosdep(manifest: ElementTree.Element) -> None:
     assert (manifest.tag, manifest.get('format')) == ('package', '3')
     assert manifest.findtext('export/build_type') == 'ament_python'
     assert text_of(manifest, 'license') == 'Apache-2.0'
@@ -86,14 +86,14 @@ def test_the_manifest_names_what_colcon_and_rosdep_need(manifest: ElementTree.El
         assert sorted(found) == sorted(names)
 
 
-def test_the_manifest_names_a_maintainer(manifest: ElementTree.Element, setup: dict[str, Any]) -> None:
+def test_manifest_names_a_maintainer(manifest: ElementTree.Element, setup: dict[str, Any]) -> None:
     maintainer = manifest.find('maintainer')
     assert maintainer is not None
     assert re.fullmatch(r'[\w.+-]+@[\w-]+(\.[\w-]+)+', maintainer.get('email', ''))
     assert (maintainer.text, maintainer.get('email')) == (setup['maintainer'], setup['maintainer_email'])
 
 
-def test_name_version_and_licence_are_the_same_everywhere(manifest: ElementTree.Element, setup: dict[str, Any]) -> None:
+def test_name_version_and_licence_agree(manifest: ElementTree.Element, setup: dict[str, Any]) -> None:
     assert text_of(manifest, 'name') == setup['name'] == NAME
     assert text_of(manifest, 'version') == setup['version'] == forward_grid_mapper.__version__
     assert text_of(manifest, 'license') == setup['license']
@@ -109,14 +109,14 @@ def test_pip_installs_what_rosdep_installs(setup: dict[str, Any]) -> None:
         assert line.startswith('ros-jazzy-')
 
 
-def test_files_that_are_no_modules_are_installed_too(setup: dict[str, Any]) -> None:
+def test_data_files_of_the_package_are_installed(setup: dict[str, Any]) -> None:
     package = ROOT / NAME
     installed = {path for pattern in setup['package_data'][NAME] for path in package.glob(pattern)}
     others = {path for path in package.rglob('*') if path.is_file() and path.suffix not in ('.py', '.pyc')}
     assert {path for path in others if '__pycache__' not in path.parts} == installed
 
 
-def test_every_command_can_be_started(setup: dict[str, Any]) -> None:
+def test_all_commands_can_be_started(setup: dict[str, Any]) -> None:
     from forward_grid_mapper.__main__ import COMMANDS
 
     scripts = dict(line.split(' = ') for line in setup['entry_points']['console_scripts'])
@@ -128,20 +128,20 @@ def test_every_command_can_be_started(setup: dict[str, Any]) -> None:
         assert callable(importlib.import_module(f'{NAME}.{module}').main)
 
 
-def test_the_citation_and_the_changes_are_of_this_version() -> None:
+def test_citation_and_changelog_have_the_current_version() -> None:
     version = forward_grid_mapper.__version__
     assert yaml.safe_load((ROOT / 'CITATION.cff').read_text())['version'] == version
     assert re.search(rf'^## {re.escape(version)}\b', (ROOT / 'CHANGELOG.md').read_text(), re.MULTILINE)
 
 
 @pytest.mark.parametrize('build', ['dist_info', 'bdist_wheel', 'editable_wheel'])
-def test_pip_puts_one_command_on_the_path(build: str) -> None:
+def test_pip_installs_one_command(build: str) -> None:
     made = given_to_setuptools(build)['entry_points']['console_scripts']
     assert made == [f'{NAME} = {NAME}.__main__:main']
 
 
 @pytest.mark.parametrize('folder', ['config', 'launch', 'rviz'])
-def test_every_file_of_a_folder_is_installed(setup: dict[str, Any], folder: str) -> None:
+def test_all_files_of_a_folder_are_installed(setup: dict[str, Any], folder: str) -> None:
     installed = dict(setup['data_files'])
     present = sorted(str(path.relative_to(ROOT)) for path in (ROOT / folder).rglob('*') if path.suffix != '.pyc')
     present = [name for name in present if (ROOT / name).is_file()]
@@ -149,7 +149,7 @@ def test_every_file_of_a_folder_is_installed(setup: dict[str, Any], folder: str)
     assert installed[f'share/{NAME}/{folder}'] == present
 
 
-def test_the_package_is_in_the_ament_index(setup: dict[str, Any]) -> None:
+def test_package_is_in_the_ament_index(setup: dict[str, Any]) -> None:
     installed = dict(setup['data_files'])
     assert installed['share/ament_index/resource_index/packages'] == [f'resource/{NAME}']
     assert installed[f'share/{NAME}'] == ['package.xml']
@@ -157,19 +157,19 @@ def test_the_package_is_in_the_ament_index(setup: dict[str, Any]) -> None:
     assert f'$base/lib/{NAME}' in (ROOT / 'setup.cfg').read_text()
 
 
-def test_every_package_with_code_is_installed(setup: dict[str, Any]) -> None:
+def test_all_packages_with_code_are_installed(setup: dict[str, Any]) -> None:
     folders = {path.parent.relative_to(ROOT) for path in (ROOT / NAME).rglob('*.py')}
     assert sorted(setup['packages']) == sorted('.'.join(folder.parts) for folder in folders)
 
 
-def test_the_lists_of_parameters_are_up_to_date() -> None:
+def test_lists_of_parameters_are_up_to_date() -> None:
     advice = 'run scripts/update_docs'
     assert (ROOT / 'config/mapper.yaml').read_text('utf-8') == dump_parameters(Parameters()), advice
     assert (ROOT / 'docs/parameters.md').read_text('utf-8') == parameters_markdown(), advice
 
 
 @pytest.mark.parametrize(('name', 'sonars'), [('ring_24', sonar_ring()), ('front_8', front_array())])
-def test_examples_hold_the_poses_of_the_simulated_sonars(name: str, sonars: SonarArray) -> None:
+def test_examples_have_the_poses_of_the_simulated_sonars(name: str, sonars: SonarArray) -> None:
     values, extrinsics, node = load_parameters(ROOT / 'config' / f'{name}.yaml')
     assert Parameters.from_flat(values).node.range_topics == ('sonar',)
     assert not node
@@ -223,7 +223,7 @@ def tracked_files() -> list[Path]:
 
 
 def test_no_file_names_the_host_of_a_registry() -> None:
-    # in parts, since this file is one of those that are searched
+    # in parts, since this file is searched as well
     parts = [('pypi', 'org'), ('pythonhosted', 'org'), ('npmjs', 'org'), ('npmjs', 'com'), ('deb', 'debian', 'org')]
     parts += [('packages', 'ros', 'org'), ('archive', 'ubuntu', 'com'), ('proxy', 'golang', 'org'), ('crates', 'io')]
     hosts = re.compile('|'.join(re.escape('.'.join(names)) for names in parts), re.IGNORECASE)

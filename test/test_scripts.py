@@ -1,4 +1,4 @@
-"""scripts/: they make an environment that works or say why not, and leave the caller where he is."""
+"""The scripts make a working environment or report why not, and do not change the working directory."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ esac
 
 
 class Caller:
-    """Somebody in a folder of his own who runs scripts of ours, with an interpreter that only pretends."""
+    """A user in another folder who runs our scripts, with a fake interpreter."""
 
     def __init__(self, folder: Path) -> None:
         self.folder, self.venv, self.log = folder / 'here', folder / 'venv', folder / 'asked'
@@ -59,13 +59,13 @@ class Caller:
         )
 
     @property
-    def asked(self) -> list[str]:
+    def calls(self) -> list[str]:
         return self.log.read_text().splitlines()
 
     @property
     def made(self) -> int:
-        """How many environments were made in the last run."""
-        return sum('|-m venv ' in line for line in self.asked)
+        """Number of environments made in the last run."""
+        return sum('|-m venv ' in line for line in self.calls)
 
 
 @pytest.fixture
@@ -73,25 +73,25 @@ def caller(tmp_path: Path) -> Caller:
     return Caller(tmp_path)
 
 
-def test_the_environment_is_made_once(caller: Caller) -> None:
+def test_environment_is_made_once(caller: Caller) -> None:
     assert caller.run('demo').returncode == 0
     assert caller.made == 1
     assert caller.run('demo').returncode == 0
     assert caller.made == 0
-    assert not any('pip install' in line for line in caller.asked)
+    assert not any('pip install' in line for line in caller.calls)
 
 
-def test_a_command_runs_where_its_caller_is(caller: Caller) -> None:
+def test_command_runs_in_the_working_directory(caller: Caller) -> None:
     assert caller.run('demo', '-o', 'out').returncode == 0
-    assert caller.asked[-1] == f'{caller.folder}|-m forward_grid_mapper demo -o out'
+    assert caller.calls[-1] == f'{caller.folder}|-m forward_grid_mapper demo -o out'
 
 
 def test_tests_run_in_the_checkout(caller: Caller) -> None:
     assert caller.run('test', '-k', 'one').returncode == 0
-    assert caller.asked[-1] == f'{ROOT}|-m pytest -n 2 --dist loadfile --no-loadscope-reorder -k one'
+    assert caller.calls[-1] == f'{ROOT}|-m pytest -n 2 --dist loadfile --no-loadscope-reorder -k one'
 
 
-def test_a_python_without_venv_is_named_with_the_remedy_and_leaves_nothing(caller: Caller) -> None:
+def test_missing_venv_is_reported_with_a_remedy(caller: Caller) -> None:
     failed = caller.run('demo', VENV_FAILS='1')
     assert failed.returncode != 0
     assert 'ensurepip is not available' in failed.stderr
@@ -100,7 +100,7 @@ def test_a_python_without_venv_is_named_with_the_remedy_and_leaves_nothing(calle
     assert caller.run('demo').returncode == 0
 
 
-def test_an_environment_that_is_half_made_is_made_anew(caller: Caller) -> None:
+def test_incomplete_environment_is_replaced(caller: Caller) -> None:
     (caller.venv / 'bin').mkdir(parents=True)
     (caller.venv / 'pyvenv.cfg').touch()
     (caller.venv / 'bin' / 'python').symlink_to('/bin/false')
@@ -108,14 +108,14 @@ def test_an_environment_that_is_half_made_is_made_anew(caller: Caller) -> None:
     assert caller.made == 1
 
 
-def test_another_python_than_that_of_the_environment_makes_it_anew(caller: Caller) -> None:
+def test_environment_of_another_python_is_replaced(caller: Caller) -> None:
     assert caller.run('demo').returncode == 0
     (caller.venv / 'bin' / 'python').write_text(PYTHON.replace('${VERSION:-3.12.1}', '3.10.2'))
     assert caller.run('demo').returncode == 0
     assert caller.made == 1
 
 
-def test_a_folder_that_is_no_environment_is_left_alone(caller: Caller) -> None:
+def test_folder_that_is_no_environment_is_kept(caller: Caller) -> None:
     caller.venv.mkdir()
     (caller.venv / 'thesis.tex').touch()
     failed = caller.run('demo')
@@ -124,7 +124,7 @@ def test_a_folder_that_is_no_environment_is_left_alone(caller: Caller) -> None:
     assert (caller.venv / 'thesis.tex').exists()
 
 
-def test_without_a_network_a_few_lines_say_so(caller: Caller) -> None:
+def test_missing_network_is_reported_in_a_few_lines(caller: Caller) -> None:
     failed = caller.run('demo', NO_NETWORK='1')
     assert failed.returncode != 0
     assert 'No matching distribution found' in failed.stderr

@@ -1,4 +1,4 @@
-"""The workflow for forges that have containers: it is what the README says, and names no host."""
+"""The workflow for forges with containers: it follows the README, and names no host."""
 
 from __future__ import annotations
 
@@ -24,12 +24,12 @@ def job() -> dict[str, Any]:
 
 
 def commands(job: dict[str, Any]) -> list[list[str]]:
-    """Words of every command line."""
+    """The words of all command lines."""
     scripts = [step['run'].replace('\\\n', ' ') for step in job['steps'] if 'run' in step]
     return [shlex.split(line) for script in scripts for line in script.splitlines() if line]
 
 
-def test_it_runs_in_the_image_of_jazzy_and_names_no_host(job: dict[str, Any]) -> None:
+def test_workflow_uses_the_jazzy_image_and_names_no_host(job: dict[str, Any]) -> None:
     assert job['container'] == 'ros:jazzy'
     text = FILE.read_text(encoding='utf-8')
     assert '://' not in text
@@ -37,14 +37,14 @@ def test_it_runs_in_the_image_of_jazzy_and_names_no_host(job: dict[str, Any]) ->
     assert [step['uses'] for step in job['steps'] if 'uses' in step] == ['actions/checkout@v4']
 
 
-def test_every_script_is_one_for_bash(job: dict[str, Any]) -> None:
+def test_all_scripts_are_valid_bash(job: dict[str, Any]) -> None:
     assert job['defaults']['run']['shell'] == 'bash'
     for step in job['steps']:
         if 'run' in step:
             subprocess.run(['bash', '-n'], input=step['run'], text=True, check=True)
 
 
-def test_it_installs_and_builds_as_the_readme_says(job: dict[str, Any]) -> None:
+def test_workflow_installs_and_builds_like_the_readme(job: dict[str, Any]) -> None:
     readme = (ROOT / 'README.md').read_text(encoding='utf-8')
     lines = [
         shlex.split(line)
@@ -52,12 +52,12 @@ def test_it_installs_and_builds_as_the_readme_says(job: dict[str, Any]) -> None:
     ]
     assert len(lines) >= 2
     assert all(line in commands(job) for line in lines if line != ['source', 'install/setup.bash'])
-    # the package lies where the README has it
+    # the package is in the folder given in the README
     (checkout,) = (step['with'] for step in job['steps'] if 'uses' in step)
     assert checkout['path'] == 'src/forward_grid_mapper'
 
 
-def test_what_it_runs_is_installed(job: dict[str, Any]) -> None:
+def test_commands_of_the_workflow_are_installed(job: dict[str, Any]) -> None:
     ran = [line for line in commands(job) if line[:3] == ['ros2', 'run', 'forward_grid_mapper']]
     assert {line[3] for line in ran} <= set(COMMANDS)
     assert any(line[3] == 'mapper' for line in ran)
@@ -65,6 +65,6 @@ def test_what_it_runs_is_installed(job: dict[str, Any]) -> None:
     assert launched and all((ROOT / 'launch' / name).is_file() for name in launched)
 
 
-def test_its_rosbags_is_the_one_of_setup(job: dict[str, Any]) -> None:
+def test_rosbags_version_is_that_of_setup(job: dict[str, Any]) -> None:
     (wanted,) = (word for line in commands(job) for word in line if word.startswith('rosbags'))
     assert wanted in (ROOT / 'setup.py').read_text(encoding='utf-8')

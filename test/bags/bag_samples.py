@@ -43,12 +43,12 @@ def write_sample(folder: Path, kind: str, *, shared_topic: bool = True, count: i
 
 
 def storage_file(bag: Path) -> Path:
-    """The one file in a bag folder that is not its metadata; a ROS 1 bag is that file itself."""
+    """The file in a bag folder that is not the metadata; for a ROS 1 bag, the bag itself."""
     return bag if bag.is_file() else next(p for p in bag.iterdir() if p.name != 'metadata.yaml')
 
 
 def write_many_chunks(folder: Path, kind: str, compression: str | None = None) -> Path:
-    """Write a bag in which every few messages have a chunk of their own."""
+    """Write a bag with a few messages in each chunk."""
     name = f'chunks_{kind}_{compression}'
     if kind == 'ros1':
         store, path = get_typestore(Stores.ROS1_NOETIC), folder / f'{name}.bag'

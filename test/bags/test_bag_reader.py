@@ -1,4 +1,4 @@
-"""Reading whole bags of every format: contents, order, where they may lie."""
+"""Reading intact bags of all formats: messages, order, transforms, and paths."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ def read_all(path: Path) -> tuple[list[object], Bag]:
 
 
 @pytest.mark.parametrize('kind', KINDS)
-def test_what_is_written_is_read_back_in_order(tmp_path: Path, kind: str) -> None:
+def test_bag_is_read_back_in_order(tmp_path: Path, kind: str) -> None:
     path = write_sample(tmp_path, kind)
     messages, bag = read_all(path)
     assert messages == sample_messages()
@@ -51,7 +51,7 @@ def test_what_is_written_is_read_back_in_order(tmp_path: Path, kind: str) -> Non
 
 
 @pytest.mark.parametrize('kind', KINDS)
-def test_topics_and_transforms(tmp_path: Path, kind: str) -> None:
+def test_topics_and_static_transforms_are_read(tmp_path: Path, kind: str) -> None:
     with Bag(write_sample(tmp_path, kind, shared_topic=False)) as bag:
         assert bag.topics() == {
             '/odom': ('nav_msgs/msg/Odometry', COUNT),
@@ -68,7 +68,7 @@ def test_topics_and_transforms(tmp_path: Path, kind: str) -> None:
 
 @pytest.mark.parametrize('kind', ['mcap', 'sqlite3'])
 @pytest.mark.parametrize('where', ['in its folder', 'alone', 'other suffix', 'odd name', 'folder without metadata'])
-def test_single_files(tmp_path: Path, kind: str, where: str) -> None:
+def test_file_of_a_bag_without_its_folder_is_read(tmp_path: Path, kind: str, where: str) -> None:
     bag = write_sample(tmp_path, kind)
     file = storage_file(bag)
     if where == 'alone':
@@ -85,12 +85,12 @@ def test_single_files(tmp_path: Path, kind: str, where: str) -> None:
     assert read.truncated is None
 
 
-def test_metadata_file_means_its_folder(tmp_path: Path) -> None:
+def test_path_of_the_metadata_reads_its_folder(tmp_path: Path) -> None:
     assert len(read_all(write_sample(tmp_path, 'mcap') / 'metadata.yaml')[0]) == 2 * COUNT
 
 
 @pytest.mark.parametrize('kind', ['mcap', 'sqlite3'])
-def test_split_bag(tmp_path: Path, kind: str) -> None:
+def test_split_bag_is_read_as_a_whole_or_by_file(tmp_path: Path, kind: str) -> None:
     first, second = (write_sample(tmp_path, kind, name=f'part_{i}') for i in (9, 10))
     whole = tmp_path / 'whole'
     whole.mkdir()
@@ -109,7 +109,7 @@ def test_split_bag(tmp_path: Path, kind: str) -> None:
 
 
 @pytest.mark.parametrize('compression', ['file', 'message', 'storage'])
-def test_compressed_mcap(tmp_path: Path, compression: str) -> None:
+def test_compressed_mcap_is_read(tmp_path: Path, compression: str) -> None:
     bag = write_many_chunks(tmp_path, 'mcap', compression)
     expected = [m for m in sample_messages() if isinstance(m, RangeMessage)]
     for path in (bag, storage_file(bag)):
@@ -121,7 +121,7 @@ def test_compressed_mcap(tmp_path: Path, compression: str) -> None:
             pass
 
 
-def test_messages_come_by_log_time_whatever_their_place_in_the_file(tmp_path: Path) -> None:
+def test_messages_are_in_order_of_log_time(tmp_path: Path) -> None:
     for kind, path in (('mcap', tmp_path / 'a'), ('sqlite3', tmp_path / 'b'), ('ros1', tmp_path / 'c.bag')):
         with BagWriter(path, kind) as writer:
             for i in range(3):
@@ -133,8 +133,8 @@ def test_messages_come_by_log_time_whatever_their_place_in_the_file(tmp_path: Pa
 
 
 @pytest.mark.parametrize('distribution', ['HUMBLE', 'JAZZY'])
-def test_sqlite3_without_definitions(tmp_path: Path, distribution: str) -> None:
-    """Range gained `variance` after Humble, whose bags do not say how their messages are made."""
+def test_sqlite3_without_definitions_is_read(tmp_path: Path, distribution: str) -> None:
+    """Range got `variance` after Humble, and bags of Humble contain no message definitions."""
     store = get_typestore(getattr(Stores, f'ROS2_{distribution}'))
     message = RANGE._replace(variance=0.25 if distribution == 'JAZZY' else 0.0)
     with rosbag2.Writer(tmp_path / 'old', version=8, storage_plugin=rosbag2.StoragePlugin.SQLITE3) as writer:
@@ -148,7 +148,7 @@ def test_sqlite3_without_definitions(tmp_path: Path, distribution: str) -> None:
         assert not bag.undecodable
 
 
-def test_messages_that_do_not_fit_are_counted(tmp_path: Path) -> None:
+def test_messages_that_cannot_be_decoded_are_counted(tmp_path: Path) -> None:
     store = get_typestore(Stores.ROS2_JAZZY)
     good = store.serialize_cdr(range_of(store, RANGE), 'sensor_msgs/msg/Range')
     with rosbag2.Writer(tmp_path / 'bag', version=9, storage_plugin=rosbag2.StoragePlugin.MCAP) as writer:
@@ -162,7 +162,7 @@ def test_messages_that_do_not_fit_are_counted(tmp_path: Path) -> None:
         assert bag.truncated is None
 
 
-def test_a_closed_bag_says_so(tmp_path: Path) -> None:
+def test_closed_bag_raises(tmp_path: Path) -> None:
     bag = Bag(write_sample(tmp_path, 'mcap'))
     with bag:
         pass
@@ -170,14 +170,14 @@ def test_a_closed_bag_says_so(tmp_path: Path) -> None:
         bag.topics()
 
 
-def test_progress(tmp_path: Path) -> None:
+def test_progress_is_reported(tmp_path: Path) -> None:
     calls = []
     with Bag(write_sample(tmp_path, 'mcap', count=1100)) as bag:
         list(bag.messages(bag.choose_topics(), lambda *call: calls.append(call)))
     assert calls == [(1000, 2200), (2000, 2200), (2200, 2200)]
 
 
-def test_paths_that_are_no_bag(tmp_path: Path) -> None:
+def test_path_without_a_bag_is_rejected_with_reason(tmp_path: Path) -> None:
     (tmp_path / 'text.mcap').write_text('not a bag\n')
     (tmp_path / 'empty.db3').touch()
     (tmp_path / 'folder').mkdir()
@@ -194,7 +194,7 @@ def test_paths_that_are_no_bag(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize('kind', KINDS)
-def test_no_permission(tmp_path: Path, kind: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_bag_without_read_permission_is_rejected(tmp_path: Path, kind: str, monkeypatch: pytest.MonkeyPatch) -> None:
     file = storage_file(write_sample(tmp_path, kind))
     file.chmod(0)
     if os.access(file, os.R_OK):  # root reads everything
@@ -207,8 +207,8 @@ def test_no_permission(tmp_path: Path, kind: str, monkeypatch: pytest.MonkeyPatc
         pass
 
 
-def test_messages_still_in_the_write_ahead_log(tmp_path: Path) -> None:
-    """A recorder that is killed leaves them there."""
+def test_messages_in_the_write_ahead_log_are_read(tmp_path: Path) -> None:
+    """A recorder that is killed leaves messages there."""
     bag = write_sample(tmp_path, 'sqlite3')
     file, killed = storage_file(bag), tmp_path / 'killed.db3'
     database = sqlite3.connect(file)
@@ -224,9 +224,7 @@ def test_messages_still_in_the_write_ahead_log(tmp_path: Path) -> None:
         assert opened.topics()['/late'][1] == COUNT
 
 
-def test_a_bag_that_is_the_working_directory_is_called_by_its_name(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_bag_in_the_working_directory_is_reported_by_name(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     bag = write_sample(tmp_path, 'mcap', name='here')
     (bag / 'metadata.yaml').write_text('relative_file_paths:\n  - absent.mcap\n')
     monkeypatch.chdir(bag)
@@ -234,8 +232,8 @@ def test_a_bag_that_is_the_working_directory_is_called_by_its_name(
         assert read.truncated is not None and read.truncated.startswith('here is damaged or cut off (absent.mcap is')
 
 
-def test_a_log_that_cannot_be_read_where_it_is(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """SQLite wants to make a file beside it, which a disk that is mounted for reading alone does not let it."""
+def test_log_of_a_bag_in_a_read_only_folder_is_rejected(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """SQLite makes a file next to the log, which is not possible on a read-only disk."""
     bag = write_sample(tmp_path, 'sqlite3')
     file = storage_file(bag)
     file.with_name(f'{file.name}-wal').write_bytes(b'7' * 100)
@@ -245,7 +243,7 @@ def test_a_log_that_cannot_be_read_where_it_is(tmp_path: Path, monkeypatch: pyte
 
 
 @pytest.mark.parametrize('kind', KINDS)
-def test_any_bytes_in_the_path(tmp_path: Path, kind: str) -> None:
+def test_bag_is_read_from_a_path_with_any_bytes(tmp_path: Path, kind: str) -> None:
     folder = tmp_path / os.fsdecode(b'n\xff?# %')
     folder.mkdir()
     path = write_sample(tmp_path, kind)
@@ -253,7 +251,7 @@ def test_any_bytes_in_the_path(tmp_path: Path, kind: str) -> None:
     assert messages == sample_messages()
 
 
-def test_transforms_of_namespaces_and_bad_ones(tmp_path: Path) -> None:
+def test_slashes_of_frames_are_removed_and_bad_transforms_rejected(tmp_path: Path) -> None:
     store = get_typestore(Stores.ROS2_JAZZY)
     types = store.types
     stamp = types['builtin_interfaces/msg/Time'](0, 0)
@@ -277,7 +275,7 @@ def test_transforms_of_namespaces_and_bad_ones(tmp_path: Path) -> None:
     assert 'broken' in transforms.rejected
 
 
-def test_a_pose_that_is_missing_stays_missing(tmp_path: Path) -> None:
+def test_missing_pose_is_read_back_as_missing(tmp_path: Path) -> None:
     with BagWriter(tmp_path / 'bag') as writer:
         writer.write_odometry('/odom', ODOMETRY._replace(pose=None))
         writer.write_range('/sonar', RANGE._replace(range=math.inf, variance=0.5))
@@ -286,7 +284,7 @@ def test_a_pose_that_is_missing_stays_missing(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(('run', 'count', 'suffix'), [('office_a', 1591, '.mcap'), ('office_b', 815, '.db3')])
-def test_real_recordings(shared: Path, run: str, count: int, suffix: str) -> None:
+def test_real_recordings_are_read(shared: Path, run: str, count: int, suffix: str) -> None:
     folder = shared / 'data' / run / 'bag'
     for path in (folder, folder / f'bag{suffix}'):
         with Bag(path) as bag:

@@ -1,4 +1,4 @@
-"""Bags written for others to play: messages, quality of service, and nothing half made."""
+"""Writing bags: messages, quality of service, and no incomplete bags."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def final_path(folder: Path, kind: str) -> Path:
 
 
 @pytest.mark.parametrize('kind', KINDS)
-def test_grid_and_latched_topics(tmp_path: Path, kind: str) -> None:
+def test_written_grid_and_latched_topics(tmp_path: Path, kind: str) -> None:
     path = final_path(tmp_path, kind)
     with BagWriter(path, kind) as writer:
         writer.write_static_transforms(EXTRINSICS, START)
@@ -57,7 +57,7 @@ def test_grid_and_latched_topics(tmp_path: Path, kind: str) -> None:
 
 
 @pytest.mark.parametrize('kind', KINDS)
-def test_existing_paths_are_refused(tmp_path: Path, kind: str) -> None:
+def test_existing_path_is_rejected(tmp_path: Path, kind: str) -> None:
     path = write_sample(tmp_path, kind, count=2)
     with pytest.raises(OutputError, match='exists already'), BagWriter(path, kind):
         pass
@@ -66,7 +66,7 @@ def test_existing_paths_are_refused(tmp_path: Path, kind: str) -> None:
 
 
 @pytest.mark.parametrize('kind', KINDS)
-def test_nothing_is_left_after_an_exception(tmp_path: Path, kind: str) -> None:
+def test_exception_leaves_no_files(tmp_path: Path, kind: str) -> None:
     path = final_path(tmp_path, kind)
     with pytest.raises(KeyboardInterrupt), BagWriter(path, kind) as writer:
         writer.write_range('/sonar', RANGE)
@@ -76,9 +76,7 @@ def test_nothing_is_left_after_an_exception(tmp_path: Path, kind: str) -> None:
 
 
 @pytest.mark.parametrize('kind', KINDS)
-def test_nothing_is_left_where_it_is_interrupted_as_it_begins(
-    tmp_path: Path, kind: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_interrupt_at_the_start_leaves_no_files(tmp_path: Path, kind: str, monkeypatch: pytest.MonkeyPatch) -> None:
     def interrupted(*unused: object) -> None:
         raise KeyboardInterrupt
 
@@ -91,7 +89,7 @@ def test_nothing_is_left_where_it_is_interrupted_as_it_begins(
 
 @pytest.mark.parametrize('kind', KINDS)
 @pytest.mark.parametrize('when', ['open', 'write', 'close'])
-def test_a_full_disk_is_told_in_words(tmp_path: Path, kind: str, when: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_full_disk_is_reported(tmp_path: Path, kind: str, when: str, monkeypatch: pytest.MonkeyPatch) -> None:
     problem = sqlite3.OperationalError('database or disk is full') if kind == 'sqlite3' else OSError(28, 'No space')
 
     def full(*unused: object) -> None:
@@ -107,7 +105,7 @@ def test_a_full_disk_is_told_in_words(tmp_path: Path, kind: str, when: str, monk
 
 
 @pytest.mark.parametrize('kind', KINDS)
-def test_a_path_taken_meanwhile_is_kept(tmp_path: Path, kind: str) -> None:
+def test_path_created_meanwhile_is_not_overwritten(tmp_path: Path, kind: str) -> None:
     path = final_path(tmp_path, kind)
     with pytest.raises(OutputError, match='exists already'), BagWriter(path, kind) as writer:
         writer.write_range('/sonar', RANGE)
@@ -117,7 +115,7 @@ def test_a_path_taken_meanwhile_is_kept(tmp_path: Path, kind: str) -> None:
 
 
 @pytest.mark.parametrize('kind', KINDS)
-def test_parents_are_made_and_files_in_the_way_reported(tmp_path: Path, kind: str) -> None:
+def test_parent_folders_are_made_and_a_file_in_place_is_reported(tmp_path: Path, kind: str) -> None:
     with BagWriter(final_path(tmp_path / 'new' / 'folder', kind), kind) as writer:
         writer.write_range('/sonar', RANGE)
     assert final_path(tmp_path / 'new' / 'folder', kind).exists()
@@ -126,7 +124,7 @@ def test_parents_are_made_and_files_in_the_way_reported(tmp_path: Path, kind: st
         pass
 
 
-def test_wrong_use(tmp_path: Path) -> None:
+def test_wrong_arguments_are_rejected_with_reason(tmp_path: Path) -> None:
     with pytest.raises(OutputError, match='mcap, sqlite3, ros1'):
         BagWriter(tmp_path / 'bag', 'hdf5')
     with pytest.raises(OutputError, match=r'must end in \.bag'), BagWriter(tmp_path / 'bag', 'ros1'):
@@ -146,7 +144,7 @@ def test_wrong_use(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize('kind', KINDS)
-def test_an_interrupted_name_with_spaces_and_accents(tmp_path: Path, kind: str) -> None:
+def test_bag_with_spaces_and_accents_in_its_name_is_read(tmp_path: Path, kind: str) -> None:
     path = write_sample(tmp_path, kind, count=2, name='Büro 1 – Süd')
     with Bag(path) as bag:
         assert len(list(bag.messages(bag.choose_topics()))) == 4

@@ -1,4 +1,4 @@
-"""Messages decoded many at once are those that rosbags decodes, bit for bit, in all formats and mixtures."""
+"""Messages decoded in batches are bit-identical to those of rosbags, in all formats and mixtures."""
 
 from __future__ import annotations
 
@@ -29,8 +29,8 @@ NAMES = ('a', 'sonar_1', 'sonar_2', 'sonar_12', 'ü', '')
 TF = 'tf2_msgs/msg/TFMessage'
 
 
-class Made:
-    """Serialized messages of chance in one of the encodings."""
+class RandomMessages:
+    """Random serialized messages in one of the encodings."""
 
     def __init__(self, encoding: str, seed: int = 0) -> None:
         self.rng = random.Random(seed)
@@ -68,7 +68,7 @@ class Made:
             position=self.type('geometry_msgs/msg/Point')(self.number(), self.number(), 0.0), orientation=turn
         )
 
-    def of(self, kind: str) -> Any:
+    def random_message(self, kind: str) -> Any:
         if kind == RANGE:
             return self.range()
         header, pose, square = self.header(self.rng.choice(NAMES)), self.pose(), np.zeros(36)
@@ -92,7 +92,7 @@ class Made:
         return self.type(TF)(transforms=items)
 
     def raw(self, kind: str) -> bytes:
-        message = self.of(kind)
+        message = self.random_message(kind)
         if self.encoding == 'ros1':
             return bytes(self.store.serialize_ros1(message, kind))
         return bytes(self.store.serialize_cdr(message, kind, little_endian=self.encoding == 'cdr'))
@@ -122,13 +122,13 @@ def same(one: MessageBatch, other: MessageBatch) -> None:
 
 @pytest.mark.parametrize('encoding', ['cdr', 'cdr_big', 'ros1'])
 @pytest.mark.parametrize('kind', [RANGE, *POSES])
-def test_many_at_once_are_those_of_rosbags(kind: str, encoding: str) -> None:
-    made = Made(encoding)
+def test_batches_equal_the_messages_of_rosbags(kind: str, encoding: str) -> None:
+    made = RandomMessages(encoding)
     data = [made.raw(kind) for _ in range(400)]
     for k in range(0, 400, 23):
         data[k] = data[k][: made.rng.randrange(len(data[k]))]
     for k in range(5, 400, 31):
-        # a length or a letter that is no longer one
+        # a length or a letter that is now invalid
         data[k] = data[k][:12] + b'\xff' + data[k][13:]
     decoder = Decoder(kind, 'ros1' if encoding == 'ros1' else 'cdr', 'none', '')
     decode = Columns(decoder, _CONVERSIONS[kind])
@@ -139,8 +139,8 @@ def test_many_at_once_are_those_of_rosbags(kind: str, encoding: str) -> None:
     same(joined([*found, batch_of([])]), expected)
 
 
-def test_most_messages_are_not_decoded_one_by_one(monkeypatch: pytest.MonkeyPatch) -> None:
-    made, calls = Made('cdr'), []
+def test_messages_of_a_batch_are_not_decoded_one_by_one(monkeypatch: pytest.MonkeyPatch) -> None:
+    made, calls = RandomMessages('cdr'), []
     monkeypatch.setattr(Columns, '_one_by_one', lambda self, messages: (calls.extend(messages), ([], []))[1])
     decode = Columns(Decoder(RANGE, 'cdr', 'none', ''), _CONVERSIONS[RANGE])
     found, _ = decode.decode(np.arange(300), [made.raw(RANGE) for _ in range(300)])
@@ -148,7 +148,7 @@ def test_most_messages_are_not_decoded_one_by_one(monkeypatch: pytest.MonkeyPatc
     assert sum(len(batch.ranges.place) for batch in found) == 300
 
 
-def test_definitions_of_humble_and_of_jazzy_in_one_topic() -> None:
+def test_messages_of_humble_and_jazzy_in_one_topic_are_decoded() -> None:
     stores = [get_typestore(store) for store in (Stores.ROS2_HUMBLE, Stores.ROS2_JAZZY)]
     sample = RangeMessage(START, 'sonar', 1.5, 0.25, 4.0, 0.5, 0.0)
     data = [bytes(stores[k % 2].serialize_cdr(range_of(stores[k % 2], sample), RANGE)) for k in range(10)]
@@ -158,8 +158,8 @@ def test_definitions_of_humble_and_of_jazzy_in_one_topic() -> None:
     assert [m for _, m in joined(found).ranges.one_by_one()] == [sample] * 10
 
 
-def test_a_layout_that_rosbags_contradicts_is_not_used(monkeypatch: pytest.MonkeyPatch) -> None:
-    made = Made('cdr')
+def test_layout_that_disagrees_with_rosbags_is_not_used(monkeypatch: pytest.MonkeyPatch) -> None:
+    made = RandomMessages('cdr')
     data = [made.raw(RANGE) for _ in range(50)]
     decoder = Decoder(RANGE, 'cdr', 'none', '')
     expected, _ = one_by_one(decoder, RANGE, data)
@@ -177,9 +177,9 @@ def test_a_layout_that_rosbags_contradicts_is_not_used(monkeypatch: pytest.Monke
     same(joined(found), expected)
 
 
-def test_layouts_without_end_are_not_kept(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_number_of_kept_layouts_is_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(columns, 'MOST_LAYOUTS', 3)
-    made = Made('cdr')
+    made = RandomMessages('cdr')
     data = [made.raw(RANGE) for _ in range(100)]
     decoder = Decoder(RANGE, 'cdr', 'none', '')
     decode = Columns(decoder, _CONVERSIONS[RANGE])
@@ -191,7 +191,7 @@ def test_layouts_without_end_are_not_kept(monkeypatch: pytest.MonkeyPatch) -> No
 # ---- chunks
 
 
-def test_chunks_are_read_as_rosbags_reads_them(tmp_path: Path) -> None:
+def test_chunks_are_read_as_by_rosbags(tmp_path: Path) -> None:
     paths = [write_sample(tmp_path, 'mcap'), *(write_many_chunks(tmp_path, 'mcap', c) for c in (None, 'storage'))]
     for path in paths:
         with rosbag2.Reader(path) as reader:
@@ -212,7 +212,7 @@ def test_chunks_that_overlap_are_merged_as_by_rosbags(tmp_path: Path) -> None:
         topics = [writer.add_connection(f'/s{k}', RANGE, typestore=store) for k in range(3)]
         for k in range(300):
             sample = RangeMessage(START, f's{k}', 1.0, 0.25, 4.0, 0.5)
-            # many of one time, and whole chunks out of order
+            # many messages with the same time, and whole chunks out of order
             time = START + rng.randrange(40) + 10 * (k // 50) * rng.choice([0, 1, 1])
             writer.write(rng.choice(topics), time, store.serialize_cdr(range_of(store, sample), RANGE))
             if rng.random() < 0.1:
@@ -225,7 +225,7 @@ def test_chunks_that_overlap_are_merged_as_by_rosbags(tmp_path: Path) -> None:
     single.close()
 
 
-def test_damage_within_chunks_is_that_of_rosbags(tmp_path: Path) -> None:
+def test_damaged_chunks_are_read_as_by_rosbags(tmp_path: Path) -> None:
     path = write_many_chunks(tmp_path, 'mcap')
     file = next(path.glob('*.mcap'))
     whole = file.read_bytes()
@@ -261,7 +261,7 @@ def test_damage_within_chunks_is_that_of_rosbags(tmp_path: Path) -> None:
     assert compared > 20
 
 
-def test_messages_are_those_of_their_batches(tmp_path: Path) -> None:
+def test_batches_contain_all_messages_in_order(tmp_path: Path) -> None:
     for kind in ('mcap', 'sqlite3', 'ros1'):
         with Bag(write_sample(tmp_path, kind, name=kind, count=COUNT)) as bag:
             batches = list(bag.batches(bag.choose_topics()))

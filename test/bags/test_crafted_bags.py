@@ -1,7 +1,7 @@
-"""Bags made to take time or memory without end: each is read or refused in words, within 20 s of work and 1.5 GB.
+"""Bags made to use unlimited time or memory: each is read or rejected, within 20 s of processor time and 1.5 GB.
 
-Every attempt has a process of its own with a limit on its address space and its processor time, and a time-out. It is
-a child of one that has imported what it needs, which takes longer than most attempts.
+Each attempt runs in a separate process with limits of address space and processor time, and a time-out. It is a child
+of a process that has already imported the package, which takes longer than most attempts.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ from forward_grid_mapper.core.common.errors import BagError
 from forward_grid_mapper.core.messages.message_types import RangeMessage
 
 SECONDS = 20
-"""Of processor time; a busy machine may take longer."""
+"""Processor time; a busy machine may take longer."""
 
 PATIENCE = 300
 MEMORY = 3 << 29
@@ -69,20 +69,20 @@ for line in sys.stdin:
             os._exit(code)
     print('ended with', os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]), flush=True)
 """
-"""Reads the bag of each line in a child with the limits, which needs not import anything."""
+"""Reads the bag of each input line in a child with the limits, which has nothing to import."""
 
 BOMB = 1 << 30
-"""Bytes that a bomb claims, or unpacks to."""
+"""Bytes that a bomb claims to have, or unpacks to."""
 
 
 class Reader:
-    """The process whose children read bags; it is started when it is needed, and again if one had no end."""
+    """The process whose children read bags. It is started on demand, and again after a time-out."""
 
     def __init__(self) -> None:
         self._process: subprocess.Popen[str] | None = None
 
     def read(self, path: Path) -> list[str]:
-        """Return the lines that a child printed; it must have ended well, and in time."""
+        """Return the lines printed by a child, which must end without error and in time."""
         if self._process is None or self._process.poll() is not None:
             self._process = self._start()
         assert self._process.stdin is not None and self._process.stdout is not None
@@ -130,9 +130,9 @@ READ = Reader()
 
 
 def attempt(path: Path) -> tuple[int, str, int]:
-    """Read a bag; return the number of messages or -1, what was said, and how many messages did not fit."""
-    count, said, unfit = READ.read(path)
-    return int(count), said, int(unfit)
+    """Read a bag; return the number of messages or -1, the message to the user, and the number of unfit messages."""
+    count, message, unfit = READ.read(path)
+    return int(count), message, int(unfit)
 
 
 def changed(bag: Path, *statements: str) -> Path:
@@ -146,7 +146,7 @@ def changed(bag: Path, *statements: str) -> Path:
     return file
 
 
-def test_a_sound_bag_fits_into_the_limits(tmp_path: Path) -> None:
+def test_intact_bag_is_read_within_the_limits(tmp_path: Path) -> None:
     assert attempt(write_sample(tmp_path, 'mcap')) == (2 * COUNT, '', 0)
 
 
@@ -156,28 +156,28 @@ def test_a_sound_bag_fits_into_the_limits(tmp_path: Path) -> None:
 ENDLESS = 'WITH RECURSIVE r(i) AS (SELECT 1 UNION ALL SELECT i + 1 FROM r)'
 
 
-def test_a_view_named_messages(tmp_path: Path) -> None:
+def test_view_named_messages_is_rejected(tmp_path: Path) -> None:
     file = changed(
         write_sample(tmp_path, 'sqlite3'),
         'DROP TABLE messages',
         f"CREATE VIEW messages AS {ENDLESS} SELECT i AS id, 1 AS topic_id, i AS timestamp, x'00' AS data FROM r",
     )
-    count, said, _ = attempt(file)
-    assert count == -1 and str(file) in said and "'messages' is a view" in said
+    count, message, _ = attempt(file)
+    assert count == -1 and str(file) in message and "'messages' is a view" in message
 
 
-def test_a_view_named_topics(tmp_path: Path) -> None:
+def test_view_named_topics_is_rejected(tmp_path: Path) -> None:
     file = changed(
         write_sample(tmp_path, 'sqlite3'),
         'DROP TABLE topics',
         f"CREATE VIEW topics AS {ENDLESS} SELECT i AS id, '/t' AS name, 'a/msg/B' AS type, "
         f"'cdr' AS serialization_format, '' AS offered_qos_profiles, '' AS type_description_hash FROM r",
     )
-    count, said, _ = attempt(file)
-    assert count == -1 and "'topics' is a view" in said
+    count, message, _ = attempt(file)
+    assert count == -1 and "'topics' is a view" in message
 
 
-def test_a_computed_column(tmp_path: Path) -> None:
+def test_computed_column_is_rejected(tmp_path: Path) -> None:
     file = changed(
         write_sample(tmp_path, 'sqlite3'),
         'DROP TABLE messages',
@@ -185,12 +185,12 @@ def test_a_computed_column(tmp_path: Path) -> None:
         'data BLOB AS (zeroblob(900000000)))',
         'INSERT INTO messages(topic_id, timestamp) VALUES (1, 1), (1, 2)',
     )
-    count, said, _ = attempt(file)
-    assert count == -1 and "column 'data'" in said and 'computed' in said
+    count, message, _ = attempt(file)
+    assert count == -1 and "column 'data'" in message and 'computed' in message
 
 
-def test_more_rows_than_the_file_can_hold(tmp_path: Path) -> None:
-    """A page of the table's tree that refers to the page above it: rows without end."""
+def test_endless_rows_are_rejected(tmp_path: Path) -> None:
+    """A page in the tree of a table refers to the page above it, so the rows never end."""
     file = storage_file(write_sample(tmp_path, 'sqlite3', count=600))
     database = sqlite3.connect(file)
     (root,) = database.execute("SELECT rootpage FROM sqlite_master WHERE name = 'messages'").fetchone()
@@ -202,7 +202,7 @@ def test_more_rows_than_the_file_can_hold(tmp_path: Path) -> None:
     cells = struct.unpack_from('>H', content, at + 3)[0]
     pointers = struct.unpack_from(f'>{cells}H', content, at + 12)
     leaf = struct.unpack_from('>I', content, at + pointers[0])[0]
-    # an inner page in place of a leaf, all of whose cells lead to the second leaf, and so down four levels
+    # an inner page in place of a leaf; all its cells lead to the second leaf, and so on down four levels
     second = struct.unpack_from('>I', content, at + pointers[1])[0]
     fourth = [struct.unpack_from('>I', content, at + p)[0] for p in pointers[2:6]]
     below = second
@@ -217,11 +217,11 @@ def test_more_rows_than_the_file_can_hold(tmp_path: Path) -> None:
             struct.pack_into('>IB', content, begin + place, below, n % 128)
         below = page
     file.write_bytes(content)
-    _, said, _ = attempt(file)
-    assert said
+    _, message, _ = attempt(file)
+    assert message
 
 
-def test_a_table_by_another_name_does_not_fool_the_check(tmp_path: Path) -> None:
+def test_extra_tables_and_views_do_not_mislead_the_check(tmp_path: Path) -> None:
     file = changed(
         write_sample(tmp_path, 'sqlite3'),
         'CREATE TABLE pragma_table_xinfo(name, hidden)',
@@ -265,14 +265,14 @@ SOUND = 'float32 x\n'
     ],
     ids=['strings', 'just too many', 'nothing', 'no end', 'nested', 'itself', 'blank lines', 'long'],
 )
-def test_definitions_that_explode(tmp_path: Path, definition: str) -> None:
+def test_exploding_message_definition_is_rejected_or_unfit(tmp_path: Path, definition: str) -> None:
     assert Decoder('sensor_msgs/msg/Range', 'cdr', 'msg', definition)
     data = b'\0\1\0\0' + b'\xff' * 400
-    count, said, unfit = attempt(with_definition(tmp_path, definition, data))
-    assert unfit == 3 or (count == -1 and said), (count, said, unfit)
+    count, message, unfit = attempt(with_definition(tmp_path, definition, data))
+    assert unfit == 3 or (count == -1 and message), (count, message, unfit)
 
 
-def test_40_kb_of_blank_lines_in_a_definition(tmp_path: Path) -> None:
+def test_definition_with_40_kb_of_blank_lines_is_read(tmp_path: Path) -> None:
     store = get_typestore(Stores.ROS2_JAZZY)
     message = next(m for m in sample_messages() if isinstance(m, RangeMessage))
     data = bytes(store.serialize_cdr(range_of(store, message), 'sensor_msgs/msg/Range'))
@@ -285,7 +285,7 @@ def test_40_kb_of_blank_lines_in_a_definition(tmp_path: Path) -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize('filling', ['\n', ' \n', 'relative_file_paths:\n', '  - x\n', '-\n'])
-def test_40_kb_of_nothing_in_the_metadata(tmp_path: Path, filling: str) -> None:
+def test_metadata_with_40_kb_of_filling_is_read_or_rejected(tmp_path: Path, filling: str) -> None:
     bag = write_sample(tmp_path, 'mcap')
     metadata = bag / 'metadata.yaml'
     text = metadata.read_text()
@@ -295,23 +295,23 @@ def test_40_kb_of_nothing_in_the_metadata(tmp_path: Path, filling: str) -> None:
         text.replace('_paths:\n', '_paths:\n' + filling * 40_000),
     ):
         metadata.write_text(content)
-        count, said, _ = attempt(bag)
-        assert count == 2 * COUNT or said, content[:40]
+        count, message, _ = attempt(bag)
+        assert count == 2 * COUNT or message, content[:40]
 
 
-def test_metadata_without_end(tmp_path: Path) -> None:
+def test_huge_metadata_is_rejected(tmp_path: Path) -> None:
     bag = write_sample(tmp_path, 'mcap')
     with (bag / 'metadata.yaml').open('r+b') as file:
         file.truncate(1 << 40)
-    count, said, _ = attempt(bag)
-    assert count == -1 and 'metadata.yaml has more than' in said
+    count, message, _ = attempt(bag)
+    assert count == -1 and 'metadata.yaml has more than' in message
 
 
-# ---- what unpacks to very much
+# ---- small files that unpack to very much
 
 
 def mcap_with(folder: Path, compression: str, packed: bytes, size: int, times: int = 1, *, index: bool = False) -> Path:
-    """A file of `times` equal chunks of zeros, or of whatever unpacks from `packed`, that state `size`."""
+    """A file of `times` equal chunks, which are zeros or `packed`, and which claim to have `size` bytes."""
 
     def text(value: str) -> bytes:
         return struct.pack('<I', len(value)) + value.encode()
@@ -355,24 +355,24 @@ PACKERS: dict[str, Callable[[bytes], bytes]] = {'zstd': zstd.compress, 'lz4': lz
 @pytest.mark.parametrize('index', [False, True])
 @pytest.mark.parametrize('stated', [100, 1 << 20, BOMB, 1 << 62])
 @pytest.mark.parametrize('compression', ['zstd', 'lz4'])
-def test_one_chunk_of_a_gigabyte(tmp_path: Path, compression: str, stated: int, index: bool) -> None:
+def test_chunk_of_a_gigabyte_is_rejected(tmp_path: Path, compression: str, stated: int, index: bool) -> None:
     packed = 8 * PACKERS[compression](bytes(BOMB // 8))
-    count, said, _ = attempt(mcap_with(tmp_path, compression, packed, stated, index=index))
-    assert count in (-1, 0) and said
-    assert 'bomb.mcap' in said
+    count, message, _ = attempt(mcap_with(tmp_path, compression, packed, stated, index=index))
+    assert count in (-1, 0) and message
+    assert 'bomb.mcap' in message
 
 
 @pytest.mark.parametrize('index', [False, True])
-def test_many_chunks_that_are_admitted_one_by_one(tmp_path: Path, index: bool) -> None:
+def test_many_chunks_that_are_too_large_together_are_rejected(tmp_path: Path, index: bool) -> None:
     size = 1 << 26
-    # one attachment, which is passed over
+    # one attachment, which is skipped
     packed = zstd.compress(struct.pack('<BQ', 9, size - 9) + bytes(size - 9))
-    count, said, _ = attempt(mcap_with(tmp_path, 'zstd', packed, size, 300, index=index))
-    assert count in (-1, 0) and 'unpack to more than' in said
+    count, message, _ = attempt(mcap_with(tmp_path, 'zstd', packed, size, 300, index=index))
+    assert count in (-1, 0) and 'unpack to more than' in message
 
 
 @pytest.mark.parametrize('compression', ['bz2', 'lz4'])
-def test_a_ros1_bag_of_a_gigabyte(tmp_path: Path, compression: str) -> None:
+def test_ros1_chunk_of_a_gigabyte_is_reported_and_others_read(tmp_path: Path, compression: str) -> None:
     bag = write_many_chunks(tmp_path, 'ros1', compression)
     content = bag.read_bytes()
     packed = 32 * PACKERS[compression](bytes(BOMB // 32))
@@ -380,13 +380,13 @@ def test_a_ros1_bag_of_a_gigabyte(tmp_path: Path, compression: str) -> None:
     at = content.index(mark)
     (size,) = struct.unpack_from('<I', content, at - 4)
     bag.write_bytes(content[: at - 4] + struct.pack('<I', len(packed)) + packed + content[at + size :])
-    count, said, _ = attempt(bag)
-    assert bag.name in said and 'damaged' in said
+    count, message, _ = attempt(bag)
+    assert bag.name in message and 'damaged' in message
     assert count > COUNT // 2, 'the other chunks are still worth having'
 
 
 @pytest.mark.parametrize('kind', ['sqlite3', 'mcap'])
-def test_a_compressed_file_of_a_gigabyte(tmp_path: Path, kind: str) -> None:
+def test_compressed_file_of_a_gigabyte_is_rejected(tmp_path: Path, kind: str) -> None:
     bag = write_sample(tmp_path, kind)
     file = storage_file(bag)
     metadata = bag / 'metadata.yaml'
@@ -402,11 +402,11 @@ def test_a_compressed_file_of_a_gigabyte(tmp_path: Path, kind: str) -> None:
     assert 'FILE' in metadata.read_text()
     assert attempt(bag) == (2 * COUNT, '', 0)
     packed.write_bytes(4 * zstd.compress(bytes(BOMB // 4)))
-    count, said, _ = attempt(bag)
-    assert count == -1 and str(packed) in said and 'unpacks to more than' in said
+    count, message, _ = attempt(bag)
+    assert count == -1 and str(packed) in message and 'unpacks to more than' in message
 
 
-def test_a_compressed_message_of_a_gigabyte(tmp_path: Path) -> None:
+def test_compressed_message_of_a_gigabyte_is_counted_as_unfit(tmp_path: Path) -> None:
     bag = write_many_chunks(tmp_path, 'mcap', 'message')
     file = storage_file(bag)
     assert attempt(bag)[0] == COUNT
@@ -421,7 +421,7 @@ def test_a_compressed_message_of_a_gigabyte(tmp_path: Path) -> None:
     assert unfit == 3
 
 
-def test_what_unpack_gives_and_refuses() -> None:
+def test_unpack_is_bounded_and_rejects_unknown_formats() -> None:
     data = bytes(range(256)) * 40
     for name, pack in PACKERS.items():
         assert bounds.unpack(name, pack(data) + pack(data), 2 * len(data)) == data * 2
@@ -432,10 +432,10 @@ def test_what_unpack_gives_and_refuses() -> None:
         bounds.unpack('zip', data, 1000)
 
 
-# ---- what is no file
+# ---- paths that are no regular files
 
 
-def test_pipes_sockets_and_devices(tmp_path: Path) -> None:
+def test_pipes_sockets_and_devices_are_rejected(tmp_path: Path) -> None:
     os.mkfifo(tmp_path / 'pipe')
     with socket.socket(socket.AF_UNIX) as server:
         here = Path.cwd()
@@ -447,28 +447,28 @@ def test_pipes_sockets_and_devices(tmp_path: Path) -> None:
             os.chdir(here)
         (tmp_path / 'device').symlink_to('/dev/zero')
         for name in ('pipe', 'socket', 'device'):
-            count, said, _ = attempt(tmp_path / name)
-            assert count == -1 and name in said and 'Give a bag folder' in said
+            count, message, _ = attempt(tmp_path / name)
+            assert count == -1 and name in message and 'Give a bag folder' in message
     for name in ('bag.mcap', 'metadata.yaml'):
         bag = write_sample(tmp_path, 'mcap', name=f'with a pipe for {name}')
         file = storage_file(bag) if name != 'metadata.yaml' else bag / name
         file.unlink()
         os.mkfifo(file)
-        count, said, _ = attempt(bag)
+        count, message, _ = attempt(bag)
         if name == 'metadata.yaml':
             assert count == 2 * COUNT, 'the only file will do'
         else:
-            assert count == -1 and str(file) in said and 'not a regular file' in said
+            assert count == -1 and str(file) in message and 'not a regular file' in message
 
 
-# ---- metadata that say less usual things
+# ---- unusual but valid metadata
 
 
 @pytest.mark.parametrize('kind', ['mcap', 'sqlite3'])
 @pytest.mark.parametrize(
     'name', ['a, b', "it's", 'say "so"', ' - x', '[one]', 'a: b', '#1', 'with spaces ' * 10, 'ä, ö']
 )
-def test_any_folder_name(tmp_path: Path, kind: str, name: str) -> None:
+def test_bag_in_a_folder_of_any_name_is_read(tmp_path: Path, kind: str, name: str) -> None:
     if kind == 'sqlite3' and '#' in name:
         pytest.skip('rosbags cannot write it')
     bag = write_sample(tmp_path, kind, name=name)
@@ -480,7 +480,7 @@ def test_any_folder_name(tmp_path: Path, kind: str, name: str) -> None:
 @pytest.mark.parametrize(
     'style', ['[{0}]', "['{0}']", '["{0}", ]', '\n    - {0}', '\n  - \'{0}\'\n  - "{0}"', '[{0}, {0}]']
 )
-def test_a_file_that_is_listed_again_counts_once(tmp_path: Path, style: str) -> None:
+def test_file_listed_twice_is_read_once(tmp_path: Path, style: str) -> None:
     bag = write_sample(tmp_path, 'mcap')
     (bag / 'link.mcap').symlink_to('bag.mcap')
     metadata = bag / 'metadata.yaml'
@@ -497,7 +497,7 @@ def test_a_file_that_is_listed_again_counts_once(tmp_path: Path, style: str) -> 
         assert opened.truncated is not None and 'gone.mcap is missing' in opened.truncated
 
 
-def test_a_file_of_a_compressed_bag_alone(tmp_path: Path) -> None:
+def test_single_file_of_a_compressed_bag_is_rejected_with_a_remedy(tmp_path: Path) -> None:
     bag = write_many_chunks(tmp_path, 'mcap', 'file')
     with pytest.raises(BagError, match='zstd -d'), Bag(storage_file(bag).rename(tmp_path / 'alone.mcap.zstd')):
         pass

@@ -1,4 +1,4 @@
-"""Bags that are cut off or have flipped bits give what is intact, or a BagError; never anything else."""
+"""Truncated bags and bags with flipped bits give the intact messages or a BagError."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def read(path: Path) -> tuple[list[object], str | None]:
 
 
 @pytest.mark.parametrize('kind', KINDS)
-def test_cut_files(tmp_path: Path, kind: str) -> None:
+def test_truncated_bag_gives_the_intact_messages(tmp_path: Path, kind: str) -> None:
     bag = write_sample(tmp_path, kind)
     file = storage_file(bag)
     content, whole = file.read_bytes(), sample_messages()
@@ -55,7 +55,7 @@ def test_cut_files(tmp_path: Path, kind: str) -> None:
 
 
 @pytest.mark.parametrize('kind', KINDS)
-def test_every_cut_near_the_ends(tmp_path: Path, kind: str) -> None:
+def test_bag_truncated_near_its_ends_is_reported(tmp_path: Path, kind: str) -> None:
     file = storage_file(write_sample(tmp_path, kind, count=3))
     content = file.read_bytes()
     for size in (*range(1, 200), *range(len(content) - 200, len(content))):
@@ -68,7 +68,7 @@ def test_every_cut_near_the_ends(tmp_path: Path, kind: str) -> None:
 
 
 @pytest.mark.parametrize('kind', KINDS)
-def test_flipped_bits(tmp_path: Path, kind: str) -> None:
+def test_bag_with_flipped_bits_is_read_or_rejected_in_time(tmp_path: Path, kind: str) -> None:
     bag = write_sample(tmp_path, kind, count=20)
     file = storage_file(bag)
     content = file.read_bytes()
@@ -86,7 +86,7 @@ def test_flipped_bits(tmp_path: Path, kind: str) -> None:
         assert time.monotonic() - begin < 5.0
 
 
-def test_flipped_bits_in_metadata(tmp_path: Path) -> None:
+def test_metadata_with_flipped_bits_is_read_or_rejected(tmp_path: Path) -> None:
     bag = write_sample(tmp_path, 'mcap', count=20)
     metadata = bag / 'metadata.yaml'
     content = metadata.read_bytes()
@@ -101,7 +101,7 @@ def test_flipped_bits_in_metadata(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ('kind', 'compression'), [('mcap', None), ('mcap', 'storage'), ('ros1', None), ('ros1', 'bz2'), ('ros1', 'lz4')]
 )
-def test_one_bad_chunk_costs_only_its_own_messages(tmp_path: Path, kind: str, compression: str | None) -> None:
+def test_damaged_chunk_loses_only_its_own_messages(tmp_path: Path, kind: str, compression: str | None) -> None:
     bag = write_many_chunks(tmp_path, kind, compression)
     file = storage_file(bag)
     content = bytearray(file.read_bytes())
@@ -109,7 +109,7 @@ def test_one_bad_chunk_costs_only_its_own_messages(tmp_path: Path, kind: str, co
     at = -1
     for _ in range(6):
         at = content.index(mark, at + 1)
-    content[at : at + 60] = bytes(60)  # more than a message: what follows it must be found again
+    content[at : at + 60] = bytes(60)  # more than a message: the next message must be found again
     file.write_bytes(content)
     expected = [m for m in sample_messages() if isinstance(m, RangeMessage)]
     with Bag(file) as opened:
@@ -122,7 +122,7 @@ def test_one_bad_chunk_costs_only_its_own_messages(tmp_path: Path, kind: str, co
 
 
 @pytest.mark.parametrize(('kind', 'compression'), [('mcap', None), ('mcap', 'storage'), ('ros1', 'bz2')])
-def test_a_recording_that_was_killed_has_no_index(tmp_path: Path, kind: str, compression: str | None) -> None:
+def test_bag_without_index_after_a_kill_is_read(tmp_path: Path, kind: str, compression: str | None) -> None:
     file = storage_file(write_many_chunks(tmp_path, kind, compression))
     content = file.read_bytes()
     file.write_bytes(content[: len(content) * 7 // 10])
@@ -136,7 +136,7 @@ def test_a_recording_that_was_killed_has_no_index(tmp_path: Path, kind: str, com
     assert messages == expected[: len(messages)]
 
 
-def test_a_damaged_file_of_a_split_bag_costs_only_itself(tmp_path: Path) -> None:
+def test_damaged_file_of_a_split_bag_loses_only_its_messages(tmp_path: Path) -> None:
     bag = write_sample(tmp_path, 'mcap')
     (bag / 'second.mcap').write_bytes(b'\x89MCAP0\r\n')
     metadata = bag / 'metadata.yaml'
@@ -146,7 +146,7 @@ def test_a_damaged_file_of_a_split_bag_costs_only_itself(tmp_path: Path) -> None
     assert truncated is not None and 'second.mcap' in truncated
 
 
-def test_a_file_that_the_metadata_do_not_list_is_told(tmp_path: Path) -> None:
+def test_file_missing_in_the_metadata_is_reported(tmp_path: Path) -> None:
     bag = write_sample(tmp_path, 'mcap')
     shutil.copy(bag / 'bag.mcap', bag / 'bag_1.mcap')
     messages, truncated = read(bag)
@@ -156,13 +156,13 @@ def test_a_file_that_the_metadata_do_not_list_is_told(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize('kind', ['mcap', 'sqlite3'])
-def test_a_plain_file_whose_metadata_say_that_it_is_compressed(tmp_path: Path, kind: str) -> None:
+def test_unpacked_file_with_metadata_of_a_compressed_one_is_read(tmp_path: Path, kind: str) -> None:
     bag = write_sample(tmp_path, kind)
     metadata = bag / 'metadata.yaml'
     metadata.write_text(metadata.read_text().replace("compression_mode: ''", 'compression_mode: FILE'))
     assert 'FILE' in metadata.read_text()
     assert read(bag) == (sample_messages(), None)
-    # unpacked beside the packed one, which it leaves listed or not
+    # unpacked next to the packed file, which stays listed or not
     file = storage_file(bag)
     (bag / f'{file.name}.zstd').write_bytes(zstd.compress(file.read_bytes()))
     assert read(bag) == (sample_messages(), None)
@@ -170,7 +170,7 @@ def test_a_plain_file_whose_metadata_say_that_it_is_compressed(tmp_path: Path, k
     assert read(bag) == (sample_messages(), None)
 
 
-def test_a_compressed_file_without_metadata_is_seen(tmp_path: Path) -> None:
+def test_compressed_file_without_metadata_is_rejected_with_a_remedy(tmp_path: Path) -> None:
     bag = write_sample(tmp_path, 'mcap')
     (bag / 'metadata.yaml').unlink()
     (bag / 'bag_1.mcap.zstd').write_bytes(zstd.compress((bag / 'bag.mcap').read_bytes()))
@@ -194,7 +194,9 @@ def packed_and_split(folder: Path) -> Path:
 
 
 @pytest.mark.parametrize('full', ['before', 'while it is written', 'no folder'])
-def test_want_of_space_is_no_damage(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, full: str) -> None:
+def test_lack_of_disk_space_is_not_reported_as_damage(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, full: str
+) -> None:
     bag = packed_and_split(tmp_path)
     assert read(bag) == ([message for message in sample_messages() for _ in range(2)], None)
     size = len(zstd.decompress((bag / 'bag_0.mcap.zstd').read_bytes()))

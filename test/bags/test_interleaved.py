@@ -61,7 +61,7 @@ SPLITS: dict[str, tuple[Callable[[int, bool, int], int], tuple[int, ...]]] = {
 
 @pytest.mark.parametrize('kind', ['mcap', 'sqlite3'])
 @pytest.mark.parametrize(('file_of', 'order'), SPLITS.values(), ids=SPLITS)
-def test_messages_come_by_log_time(
+def test_messages_are_in_order_of_log_time(
     tmp_path: Path, kind: str, file_of: Callable[[int, bool, int], int], order: tuple[int, ...]
 ) -> None:
     path = split(tmp_path, kind, file_of, order)
@@ -105,7 +105,7 @@ def read(source: Interleaved) -> list[tuple[int, bytes]]:
     return [(time, data) for _, time, data in source.messages([c.key for c in source.channels])]
 
 
-def test_a_damaged_file_does_not_end_the_others() -> None:
+def test_damaged_file_does_not_end_the_others() -> None:
     one, other = MadeUp('one', 1, 3, None, 5), MadeUp('other', 2, 4, 6)
     both = Interleaved([one, other])
     assert read(both) == [(1, b'one'), (2, b'other'), (3, b'one'), (4, b'other'), (6, b'other')]
@@ -116,7 +116,7 @@ def test_a_damaged_file_does_not_end_the_others() -> None:
     assert one.closed and other.closed
 
 
-def test_a_file_is_begun_when_its_time_has_come() -> None:
+def test_file_is_opened_when_its_time_has_come() -> None:
     one, other = MadeUp('one', 1, 2, 9), MadeUp('other', 5, 9, 10)
     messages = Interleaved([other, one]).messages([0, 1])
     assert [next(messages)[1] for _ in range(2)] == [1, 2]

@@ -1,4 +1,4 @@
-"""Bags of several robots, each in a namespace: the ranges and the fixed transforms of one of them are taken."""
+"""Bags of several robots, each in a namespace: ranges and static transforms of one robot are used."""
 
 from __future__ import annotations
 
@@ -22,10 +22,10 @@ MOUNTS = {'/r1': Pose2(0.1, 0.0, 0.0), '/r2': Pose2(0.3, 0.2, math.pi / 2)}
 
 
 class RobotWriter(BagWriter):
-    """Writes what a robot in a namespace sends."""
+    """Writes the messages of a robot in a namespace."""
 
     def write_mount(self, topic: str, mount: Pose2) -> None:
-        """Write where its sonar sits."""
+        """Write the pose of its sonar."""
         posed = self._pose(mount)
         offset = self._make('geometry_msgs/msg/Vector3', x=mount.x, y=mount.y, z=0.0)
         transform = self._make('geometry_msgs/msg/Transform', translation=offset, rotation=posed.orientation)
@@ -52,7 +52,7 @@ def two_robots(path: Path, mounts: dict[str, Pose2] = MOUNTS) -> Path:
 
 
 @pytest.mark.parametrize('robot', ['/r1', '/r2'])
-def test_one_robot_is_mapped_with_its_own_sensors(tmp_path: Path, robot: str) -> None:
+def test_robot_is_mapped_with_its_own_sensors(tmp_path: Path, robot: str) -> None:
     odometry = f'{robot}/odometry/filtered'
     with Bag(two_robots(tmp_path / 'bag')) as bag:
         topics = bag.choose_topics(odom_topic=odometry)
@@ -74,7 +74,9 @@ def test_one_robot_is_mapped_with_its_own_sensors(tmp_path: Path, robot: str) ->
         ({'/r2': MOUNTS['/r2'], '': MOUNTS['/r1']}, '', '/r2/tf_static'),
     ],
 )
-def test_topics_that_disagree_are_told(tmp_path: Path, mounts: dict[str, Pose2], taken: str, other: str) -> None:
+def test_different_static_transforms_give_a_warning(
+    tmp_path: Path, mounts: dict[str, Pose2], taken: str, other: str
+) -> None:
     with Bag(two_robots(tmp_path / 'bag', mounts)) as bag:
         transforms = bag.static_transforms(Topics(('/r1/sonar',), '/r1/odometry/filtered'))
     assert transforms.lookup('base_link', 'sonar') == pytest.approx(mounts[taken])
@@ -83,16 +85,16 @@ def test_topics_that_disagree_are_told(tmp_path: Path, mounts: dict[str, Pose2],
     assert transforms.doubts('base_link', 'base_link') == []
 
 
-def test_topics_that_agree_are_not_told(tmp_path: Path) -> None:
+def test_equal_static_transforms_give_no_warning(tmp_path: Path) -> None:
     with Bag(two_robots(tmp_path / 'bag', {'/r1': MOUNTS['/r1'], '': MOUNTS['/r1']})) as bag:
         transforms = bag.static_transforms(Topics(('/r1/sonar',), '/r1/odometry/filtered'))
     assert transforms.doubts('base_link', 'sonar') == []
 
 
-def test_ranges_of_a_robot() -> None:
+def test_range_topics_of_a_robot_are_chosen_by_namespace() -> None:
     both = ('/r1/sonar/left', '/r2/sonar')
     assert ranges_of('/r1/odom', ['/r1/odom', '/r2/odom'], both) == Assigned(both[:1], both[1:])
-    # one robot may have its odometry, or the ranges, in any namespace
+    # a single robot may have its odometry or its ranges in any namespace
     for odometry, others, ranges in (
         ('/odom', ['/odom', '/odometry/filtered'], ('/sonar', '/front/sonar')),
         ('/odometry/filtered', ['/odom', '/odometry/filtered'], ('/sonar', '/front/sonar')),
@@ -104,7 +106,7 @@ def test_ranges_of_a_robot() -> None:
     assert ranges_of('/odom', ['/odom', '/r2/odom'], ('/sonar', '/r2/sonar')) == Assigned(('/sonar',), ('/r2/sonar',))
 
 
-def test_precedence_of_fixed_transforms() -> None:
+def test_precedence_of_static_transforms() -> None:
     topics = ['/r1/tf_static', '/r2/tf_static', '/tf_static']
     assert by_precedence(topics, ['/r1/odom', '/r1/sonar']) == ['/tf_static', '/r1/tf_static']
     assert by_precedence(topics, ['/r1/odom', '/r2/sonar']) == ['/tf_static', '/r2/tf_static', '/r1/tf_static']
@@ -112,12 +114,12 @@ def test_precedence_of_fixed_transforms() -> None:
     assert by_precedence(topics, []) == by_precedence(topics, ['', '/sonar'])
 
 
-def test_the_report_of_a_drive_tells_of_it(tmp_path: Path) -> None:
+def test_report_names_left_out_topics_and_different_transforms(tmp_path: Path) -> None:
     mounts = {**MOUNTS, '': Pose2(0.0, 0.0, 0.0)}
     for robot in ('/r1', '/r2'):
         path = two_robots(tmp_path / robot[1:], mounts)
         source = read_drive(path, Parameters(), {}, None, f'{robot}/odometry/filtered').source
         assert source['range_topics'] == [f'{robot}/sonar']
         assert source['extrinsics']['sonar'] == pytest.approx(MOUNTS[robot])
-        told = ' '.join(source['warnings'])
-        assert 'are left out' in told and f'/tf_static and {robot}/tf_static contain different poses' in told
+        warnings = ' '.join(source['warnings'])
+        assert 'are left out' in warnings and f'/tf_static and {robot}/tf_static contain different poses' in warnings

@@ -1,4 +1,4 @@
-"""What is read of a damaged file: nothing that its checksum refutes, nothing twice, and nothing less than is there."""
+"""Reading of damaged files: no messages with a wrong checksum, none twice, and none missing."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def record(opcode: int, content: bytes) -> bytes:
 
 
 def mcap(path: Path, chunks: list[tuple[bytes, int]]) -> Path:
-    """An MCAP file without an index, of chunks with the checksums they state."""
+    """An MCAP file without index, with chunks that have the given checksums."""
     with path.open('wb') as file:
         file.write(b'\x89MCAP0\r\n' + record(1, text('ros2') + text('')))
         file.write(record(3, struct.pack('<H', 1) + text('sensor_msgs/msg/Range') + text('ros2msg') + text('')))
@@ -50,11 +50,11 @@ def chunk_of(message: RangeMessage) -> bytes:
     return record(5, struct.pack('<HIQQ', 1, 0, message.stamp, 0) + data)
 
 
-def test_a_chunk_that_its_checksum_refutes_is_not_believed(tmp_path: Path) -> None:
+def test_chunk_with_a_wrong_checksum_is_skipped(tmp_path: Path) -> None:
     messages = [m for m in sample_messages(3) if isinstance(m, RangeMessage)]
     chunks = [chunk_of(message) for message in messages]
     wrong = bytearray(chunks[1])
-    # one bit of the range, which stays a sound one
+    # one flipped bit in the range, which is still a valid number
     at = wrong.index(struct.pack('<f', messages[1].range))
     wrong[at + 1] ^= 1
     sound = mcap(tmp_path / 'sound.mcap', [(chunk, crc32(chunk)) for chunk in chunks])
@@ -73,11 +73,11 @@ def test_a_chunk_that_its_checksum_refutes_is_not_believed(tmp_path: Path) -> No
         list(bag.messages(Topics(('/sonar',), '')))
 
 
-# ---- where a scanner goes on
+# ---- where a scanner continues
 
 
 class Reader:
-    """A reader of rosbags that stops at damage."""
+    """A reader of rosbags that fails at damage."""
 
     start_time, end_time = 0, 10
 
@@ -125,7 +125,7 @@ WHOLE = [
 
 
 @pytest.mark.parametrize('intact', range(len(WHOLE) + 1))
-def test_a_scanner_goes_on_where_the_reader_stopped(intact: int) -> None:
+def test_scanner_continues_where_the_reader_stopped(intact: int) -> None:
     source = RosbagsSource(Reader(WHOLE[:intact]), 'cdr', lambda: Everything(WHOLE))
     found = list(source.messages({1, 2}))
     assert sorted(found) == sorted(WHOLE), 'messages of one time are neither lost nor doubled'

@@ -1,4 +1,4 @@
-"""Sensor extrinsics from a tree of fixed transforms."""
+"""Poses of sensors from a tree of static transforms."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ def about(axis: str, angle: float) -> tuple[float, float, float, float]:
     return (*vector, math.cos(angle / 2))
 
 
-def test_chain_branches_and_the_way_back() -> None:
+def test_lookup_along_a_chain_in_both_directions() -> None:
     transforms = StaticTransforms()
     transforms.add('base', 'deck', (1.0, 0.0, 0.5), about('z', math.pi / 2))
     transforms.add('/deck', '/sonar', (2.0, 0.0, 0.0), about('z', math.pi / 2))
@@ -44,7 +44,7 @@ def test_separate_trees_are_not_joined() -> None:
     assert transforms.lookup('a', 'b') is None
 
 
-def test_a_sensor_upside_down_turns_the_other_way() -> None:
+def test_yaw_of_an_upside_down_sensor_is_mirrored() -> None:
     transforms = StaticTransforms()
     transforms.add('base', 'flipped', (0.0, 0.0, 1.0), about('x', math.pi))
     transforms.add('flipped', 'sonar', (1.0, 1.0, 0.0), about('z', 0.5))
@@ -52,7 +52,7 @@ def test_a_sensor_upside_down_turns_the_other_way() -> None:
 
 
 @pytest.mark.parametrize('degrees', [-59.0, 0.0, 59.0])
-def test_tilt_is_projected(degrees: float) -> None:
+def test_pose_of_a_tilted_sensor_is_projected(degrees: float) -> None:
     transforms = StaticTransforms()
     transforms.add('base', 'turned', NONE, about('z', 1.0))
     transforms.add('turned', 'sonar', NONE, about('y', math.radians(degrees)))
@@ -60,7 +60,7 @@ def test_tilt_is_projected(degrees: float) -> None:
 
 
 @pytest.mark.parametrize(('degrees', 'side'), [(61.0, 'down'), (90.0, 'down'), (-61.0, 'up'), (-90.0, 'up')])
-def test_floor_and_ceiling_are_refused(degrees: float, side: str) -> None:
+def test_sensor_that_looks_at_floor_or_ceiling_is_rejected(degrees: float, side: str) -> None:
     transforms = StaticTransforms()
     transforms.add('base', 'sonar_9', NONE, about('y', math.radians(degrees)))
     with pytest.raises(InputError, match=f"'sonar_9' looks {side}"):
@@ -76,14 +76,14 @@ def test_floor_and_ceiling_are_refused(degrees: float, side: str) -> None:
         ((math.inf, 0.0, 0.0), IDENTITY),
     ],
 )
-def test_bad_numbers_are_refused(translation: tuple[float, ...], quaternion: tuple[float, ...]) -> None:
+def test_transform_with_bad_numbers_is_rejected(translation: tuple[float, ...], quaternion: tuple[float, ...]) -> None:
     transforms = StaticTransforms()
     with pytest.raises(InputError, match="'base' to 'sonar'"):
         transforms.add('/base', 'sonar', translation, quaternion)
     assert transforms.lookup('base', 'sonar') is None
 
 
-def test_a_rejected_transform_matters_only_on_the_way() -> None:
+def test_rejected_transform_matters_only_on_the_path() -> None:
     transforms = StaticTransforms()
     transforms.rejected['arm'] = 'the arm is broken'
     transforms.add('arm', 'sonar', NONE, IDENTITY)
@@ -93,7 +93,7 @@ def test_a_rejected_transform_matters_only_on_the_way() -> None:
         transforms.lookup('base', 'sonar')
 
 
-def test_loops_end_and_later_transforms_win() -> None:
+def test_loop_of_transforms_ends_and_later_transforms_replace() -> None:
     transforms = StaticTransforms()
     transforms.add('a', 'b', NONE, IDENTITY)
     transforms.add('b', 'a', NONE, IDENTITY)
@@ -106,13 +106,13 @@ def test_loops_end_and_later_transforms_win() -> None:
 
 
 def test_composition_agrees_with_rotating_vectors() -> None:
-    """Each step is applied to points by the formula v + 2 q × (q × v + w v)."""
+    """Each step is applied to points with the formula v + 2 q × (q × v + w v)."""
     rng = np.random.default_rng(3)
     transforms = StaticTransforms()
     origin, tip = np.zeros(3), np.array([1.0, 0.0, 0.0])
     steps = []
     for i in range(4):
-        # Small turns keep the sensor within 60° of the plane.
+        # Small turns: the sensor stays within 60° of the plane.
         quaternion = np.append(rng.normal(0.0, 0.08, 3), 1.0)
         quaternion /= np.linalg.norm(quaternion)
         steps.append((rng.normal(size=3), quaternion))
@@ -134,6 +134,6 @@ def test_composition_agrees_with_rotating_vectors() -> None:
         ((0.1, 0.2, 0.2, 0.4), '0.5'),
     ],
 )
-def test_the_length_of_a_bad_quaternion_is_told(quaternion: tuple[float, ...], length: str) -> None:
+def test_message_states_the_length_of_a_bad_quaternion(quaternion: tuple[float, ...], length: str) -> None:
     with pytest.raises(InputError, match=f'a quaternion of length {length} instead of 1'):
         StaticTransforms().add('base', 'sonar', (0.0, 0.0, 0.0), quaternion)

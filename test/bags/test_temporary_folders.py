@@ -1,4 +1,4 @@
-"""What reading a bag leaves in the temporary folder: nothing, however it ends."""
+"""Reading a bag leaves no files in the temporary folder, also after errors."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ def temporary(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return folder
 
 
-def test_files_that_were_unpacked_go_with_the_bag(split: Path, temporary: Path) -> None:
+def test_unpacked_files_are_deleted_with_the_bag(split: Path, temporary: Path) -> None:
     with Bag(split) as bag:
         assert len(list(temporary.iterdir())) == 2
         assert bag.topics()
@@ -51,8 +51,8 @@ def test_files_that_were_unpacked_go_with_the_bag(split: Path, temporary: Path) 
 
 
 @pytest.mark.parametrize('unpacked', [(0,), (1,), (0, 1)])
-def test_files_that_were_unpacked_by_hand_are_read(split: Path, temporary: Path, unpacked: tuple[int, ...]) -> None:
-    """As messages advise to do it, which leaves the metadata as they were."""
+def test_files_unpacked_by_hand_are_read(split: Path, temporary: Path, unpacked: tuple[int, ...]) -> None:
+    """As messages to the user advise; the metadata stay the same."""
     with Bag(split) as bag:
         wanted = bag.topics()
     for number in unpacked:
@@ -66,12 +66,12 @@ def test_files_that_were_unpacked_by_hand_are_read(split: Path, temporary: Path,
 
 
 @pytest.mark.parametrize(
-    ('problem', 'told'), [(KeyboardInterrupt(), KeyboardInterrupt), (PermissionError(13, 'no', 'bag_1'), BagError)]
+    ('problem', 'raised'), [(KeyboardInterrupt(), KeyboardInterrupt), (PermissionError(13, 'no', 'bag_1'), BagError)]
 )
-def test_nothing_stays_where_the_second_file_is_not_unpacked(
-    split: Path, temporary: Path, monkeypatch: pytest.MonkeyPatch, problem: BaseException, told: type[BaseException]
+def test_failure_at_the_second_file_leaves_no_files(
+    split: Path, temporary: Path, monkeypatch: pytest.MonkeyPatch, problem: BaseException, raised: type[BaseException]
 ) -> None:
-    """Ctrl-C while a large bag is unpacked is no rare thing."""
+    """For example Ctrl-C while a large bag is unpacked."""
     unpack = unpacking._unpack
 
     def interrupted(packed: Path, unpacked: Path) -> None:
@@ -80,6 +80,6 @@ def test_nothing_stays_where_the_second_file_is_not_unpacked(
         unpack(packed, unpacked)
 
     monkeypatch.setattr(unpacking, '_unpack', interrupted)
-    with pytest.raises(told), Bag(split):
+    with pytest.raises(raised), Bag(split):
         pass
     assert not list(temporary.iterdir())

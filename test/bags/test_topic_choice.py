@@ -1,4 +1,4 @@
-"""Which topics are mapped from, and what is said when that is not clear."""
+"""The choice of topics, and the messages if it is not clear."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ ODOMETRY = OdometryMessage(START, 'odom', 'base_link', Pose2(0.0, 0.0, 0.0))
 RANGE = RangeMessage(START, 'sonar_0', 1.0, 0.125, 5.0, 0.25)
 
 
-def test_choice_by_name(tmp_path: Path) -> None:
+def test_topics_are_chosen_by_name_or_rejected_with_reason(tmp_path: Path) -> None:
     with Bag(write_sample(tmp_path, 'mcap', shared_topic=False)) as bag:
         assert bag.choose_topics(['sonar_1', '/sonar_1'], 'odom') == Topics(('/sonar_1',), '/odom')
         with pytest.raises(BagError, match=r"no topic 'sonar_9'; `--range-topics` can be: /sonar_0, /sonar_1"):
@@ -28,7 +28,7 @@ def test_choice_by_name(tmp_path: Path) -> None:
             bag.choose_topics(odom_topic='/o')
 
 
-def test_several_odometry_topics_must_be_chosen_from(tmp_path: Path) -> None:
+def test_several_odometry_topics_require_a_choice(tmp_path: Path) -> None:
     with BagWriter(tmp_path / 'bag') as writer:
         writer.write_range('/sonar', RANGE)
         writer.write_odometry('/odom', ODOMETRY)
@@ -44,7 +44,7 @@ def test_several_odometry_topics_must_be_chosen_from(tmp_path: Path) -> None:
     assert '/corrected: 1 message, map → base_link' in text
 
 
-def test_bags_that_lack_something(tmp_path: Path) -> None:
+def test_bag_without_ranges_or_odometry_is_rejected(tmp_path: Path) -> None:
     with BagWriter(tmp_path / 'a') as writer:
         writer.write_odometry('/odom', ODOMETRY)
     with BagWriter(tmp_path / 'b') as writer:

@@ -1,4 +1,4 @@
-"""A short simulated drive, bags of it with any fault a test wants, and the commands run on them."""
+"""A short simulated drive, bags of it with any fault, and functions that run commands on them."""
 
 from __future__ import annotations
 
@@ -28,28 +28,28 @@ Message = OdometryMessage | RangeMessage
 
 
 class Tape(NamedTuple):
-    """What a bag is written from."""
+    """The content of a bag."""
 
     extrinsics: tuple[tuple[str, Pose2], ...]
     odometry: list[OdometryMessage]
     ranges: list[RangeMessage]
 
     def of(self, *frames: str) -> Tape:
-        """Only the ranges of these sensors."""
+        """The tape with only the ranges of these sensors."""
         return self._replace(ranges=[m for m in self.ranges if m.frame_id in frames])
 
     def with_ranges(self, **changes: Any) -> Tape:
-        """Every Range changed alike."""
+        """The tape with each Range changed."""
         return self._replace(ranges=[m._replace(**changes) for m in self.ranges])
 
     def with_odometry(self, **changes: Any) -> Tape:
-        """Every Odometry changed alike."""
+        """The tape with each Odometry changed."""
         return self._replace(odometry=[m._replace(**changes) for m in self.odometry])
 
 
 @lru_cache(maxsize=1)
 def tape() -> Tape:
-    """Past a door with eight sonars; the numbers of a Range are exact in single precision, as in its message."""
+    """A drive past a door with eight sonars; the numbers of a Range are exact in single precision."""
     recording = door_drive(1, NOISY, 0, front_array())
     exact = [
         m._replace(
@@ -60,15 +60,15 @@ def tape() -> Tape:
     return Tape(recording.extrinsics, recording.odometry, exact)
 
 
-def backwards() -> tuple[tuple[tuple[str, Pose2], ...], Tape]:
-    """Where the sonars of a ring are, and a drive past a door in which they are said to look backwards."""
+def backwards_sensors() -> tuple[tuple[tuple[str, Pose2], ...], Tape]:
+    """Poses of the sonars of a ring, and a drive past a door with transforms that rotate the sonars by 180 degrees."""
     made = door_drive(1, NOISY, 0, sonar_ring())
     wrong = tuple((frame, Pose2(-p.x, -p.y, p.yaw + math.pi)) for frame, p in made.extrinsics)
     return made.extrinsics, Tape(wrong, list(made.odometry), list(made.ranges))
 
 
 def in_turn(drive: Tape) -> list[tuple[int, Message]]:
-    """Every message with its stamp as the time of logging, a Range after the Odometry of its stamp."""
+    """All messages, logged at their stamps, a Range after the Odometry with the same stamp."""
     return sorted(((m.stamp, m) for m in (*drive.odometry, *drive.ranges)), key=lambda item: item[0])
 
 
@@ -95,7 +95,7 @@ def write_tape(
 
 
 def code_of(main: Callable[[Sequence[str]], int], *arguments: object) -> int:
-    """Run a command in this process; return its exit code, also where argparse leaves."""
+    """Run a command in this process; return its exit code, also if argparse exits."""
     try:
         return main([str(argument) for argument in arguments])
     except SystemExit as leaving:
@@ -103,7 +103,7 @@ def code_of(main: Callable[[Sequence[str]], int], *arguments: object) -> int:
 
 
 def mapped(bag: Path, output: Path, *options: object) -> dict[str, Any]:
-    """Map a bag, which must succeed; return what report.json says."""
+    """Map a bag, which must succeed; return the content of report.json."""
     assert code_of(process_bag.main, bag, '-o', output, *options) == 0
     return report_in(output)
 
@@ -135,8 +135,8 @@ def assert_same_maps(one: Path, other: Path) -> None:
         np.testing.assert_array_equal(a[name], b[name], name)
 
 
-def refusal(capsys: pytest.CaptureFixture[str], folder: Path, *arguments: object, code: int = 1) -> str:
-    """What process_bag says to wrong arguments; it must say it well and leave `folder` as it was."""
+def error_of(capsys: pytest.CaptureFixture[str], folder: Path, *arguments: object, code: int = 1) -> str:
+    """The error message of process_bag for wrong arguments; `folder` must stay unchanged."""
     before = everything_in(folder)
     capsys.readouterr()
     assert code_of(process_bag.main, *arguments) == code
@@ -150,5 +150,5 @@ def refusal(capsys: pytest.CaptureFixture[str], folder: Path, *arguments: object
 
 
 def everything_in(folder: Path) -> list[str]:
-    """Names of all files and folders at any depth."""
+    """Paths of all files and folders at any depth."""
     return sorted(str(path) for path in folder.rglob('*'))

@@ -1,4 +1,4 @@
-"""Drives and options that are wrong: an error that names the problem and the remedy, or a map with a warning."""
+"""Wrong drives and options: an error that names the problem and the remedy, or a map with a warning."""
 
 from __future__ import annotations
 
@@ -16,9 +16,9 @@ from drive_samples import (
     Tape,
     assert_same_maps,
     code_of,
+    error_of,
     in_turn,
     mapped,
-    refusal,
     report_in,
     tape,
     write_tape,
@@ -41,13 +41,13 @@ COUNT = len(tape().ranges)
 
 @pytest.fixture(autouse=True)
 def no_picture(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Drawing takes most of the time of a run, and no part in these tests."""
+    """Do not draw: it takes most of the time of a run and is not needed here."""
     monkeypatch.setattr(drawing, 'draw', lambda path, picture: None)
 
 
 @pytest.fixture(scope='module')
 def plain(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A sound bag of the drive, `bag`, and its results, `maps`."""
+    """A correct bag of the drive, `bag`, and its results, `maps`."""
     folder = tmp_path_factory.mktemp('plain')
     write_tape(folder / 'bag', tape())
     mapped(folder / 'bag', folder / 'maps')
@@ -59,43 +59,45 @@ def every(step: int, **changes: Any) -> Tape:
     return tape()._replace(ranges=[m._replace(**changes) if k % step == 0 else m for k, m in enumerate(tape().ranges)])
 
 
-def refused_drive(capsys: pytest.CaptureFixture[str], folder: Path, drive: Tape, *options: object) -> str:
-    """What is said to a bag of this drive."""
+def error_of_drive(capsys: pytest.CaptureFixture[str], folder: Path, drive: Tape, *options: object) -> str:
+    """The error message for a bag of this drive."""
     bag = write_tape(folder / 'bag', drive)
-    return refusal(capsys, folder, bag, '-o', folder / 'maps', *options)
+    return error_of(capsys, folder, bag, '-o', folder / 'maps', *options)
 
 
 # ---- bags
 
 
-def test_a_folder_that_holds_a_bag_is_told_apart_from_one(plain: Path) -> None:
-    with pytest.raises(BagError, match=r'is not a bag.* There is one in it: ') as told, Bag(plain):
+def test_folder_that_contains_a_bag_is_rejected_with_its_path(plain: Path) -> None:
+    with pytest.raises(BagError, match=r'is not a bag.* There is one in it: ') as caught, Bag(plain):
         pass
-    assert str(plain / 'bag') in str(told.value)
+    assert str(plain / 'bag') in str(caught.value)
 
 
-def test_a_folder_with_a_folder_of_bags_in_it_names_that(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_folder_with_a_folder_of_bags_is_rejected_with_its_path(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     write_tape(tmp_path / 'campus' / 'drives' / 'first', tape())
-    said = refusal(capsys, tmp_path, tmp_path / 'campus', '-o', tmp_path / 'maps')
-    assert f'There are bags in {tmp_path / "campus" / "drives"}' in said
+    error = error_of(capsys, tmp_path, tmp_path / 'campus', '-o', tmp_path / 'maps')
+    assert f'There are bags in {tmp_path / "campus" / "drives"}' in error
 
 
-def test_no_such_bag(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    said = refusal(capsys, tmp_path, tmp_path / 'absent', '-o', tmp_path / 'maps')
-    assert str(tmp_path / 'absent') in said and 'does not exist' in said and 'Give a bag' in said
+def test_absent_bag_is_rejected(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    error = error_of(capsys, tmp_path, tmp_path / 'absent', '-o', tmp_path / 'maps')
+    assert str(tmp_path / 'absent') in error and 'does not exist' in error and 'Give a bag' in error
 
 
-def test_not_a_bag(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_file_that_is_no_bag_is_rejected(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (tmp_path / 'text.bag').write_text('no bag')
     (tmp_path / 'empty.mcap').write_text('')
     (tmp_path / 'folder').mkdir()
     for name, expected in (('text.bag', 'neither an MCAP'), ('empty.mcap', '0 bytes'), ('folder', 'is not a bag')):
-        said = refusal(capsys, tmp_path, tmp_path / name, '-o', tmp_path / 'maps')
-        assert str(tmp_path / name) in said and expected in said
+        error = error_of(capsys, tmp_path, tmp_path / name, '-o', tmp_path / 'maps')
+        assert str(tmp_path / name) in error and expected in error
 
 
 @pytest.mark.parametrize('kind', ['mcap', 'sqlite3', 'ros1'])
-def test_a_bag_that_was_cut_off_is_mapped_as_far_as_it_goes(
+def test_intact_part_of_a_truncated_bag_is_mapped(
     tmp_path: Path, kind: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     bag = write_tape(tmp_path / 'cut.bag', tape(), kind)
@@ -111,52 +113,50 @@ def test_a_bag_that_was_cut_off_is_mapped_as_far_as_it_goes(
 
 
 @pytest.mark.parametrize('inside', [False, True])
-def test_a_pipe_is_not_waited_for(tmp_path: Path, capsys: pytest.CaptureFixture[str], inside: bool) -> None:
+def test_pipe_is_rejected_at_once(tmp_path: Path, capsys: pytest.CaptureFixture[str], inside: bool) -> None:
     pipe = tmp_path / 'drive.mcap'
     if inside:
         pipe = next(write_tape(tmp_path / 'bag', tape()).glob('*.mcap'))
         pipe.unlink()
     os.mkfifo(pipe)
-    said = refusal(capsys, tmp_path, pipe.parent if inside else pipe, '-o', tmp_path / 'maps')
-    assert str(pipe) in said and 'ive a bag folder' in said
+    error = error_of(capsys, tmp_path, pipe.parent if inside else pipe, '-o', tmp_path / 'maps')
+    assert str(pipe) in error and 'ive a bag folder' in error
 
 
-def test_a_bag_of_which_nothing_is_left(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_bag_without_any_intact_message_is_rejected(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     file = next(write_tape(tmp_path / 'bag', tape()).glob('*.mcap'))
     file.write_bytes(file.read_bytes()[:100])
-    said = refusal(capsys, tmp_path, file, '-o', tmp_path / 'maps')
-    assert 'cut off' in said and 'mcap recover' in said
+    error = error_of(capsys, tmp_path, file, '-o', tmp_path / 'maps')
+    assert 'cut off' in error and 'mcap recover' in error
 
 
-def test_no_range(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    said = refused_drive(capsys, tmp_path, tape()._replace(ranges=[]))
-    assert 'no sensor_msgs/Range' in said and 'LaserScan, PointCloud and other types are not read' in said
-    assert '/odom: ' in said and '/tf_static: ' in said
+def test_bag_without_ranges_is_rejected(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    error = error_of_drive(capsys, tmp_path, tape()._replace(ranges=[]))
+    assert 'no sensor_msgs/Range' in error and 'LaserScan, PointCloud and other types are not read' in error
+    assert '/odom: ' in error and '/tf_static: ' in error
 
 
-def test_transforms_that_stand_still_are_not_offered_as_odometry(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_static_transforms_are_not_offered_as_odometry(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     bag = write_tape(tmp_path / 'bag', tape())
-    said = refusal(capsys, tmp_path, bag, '-o', tmp_path / 'maps', '--odom-topic', '/nowhere')
-    assert "no topic '/nowhere'" in said and '/odom' in said and '/tf_static' not in said
+    error = error_of(capsys, tmp_path, bag, '-o', tmp_path / 'maps', '--odom-topic', '/nowhere')
+    assert "no topic '/nowhere'" in error and '/odom' in error and '/tf_static' not in error
 
 
-def test_no_odometry(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    said = refused_drive(capsys, tmp_path, tape()._replace(odometry=[]))
-    assert 'no nav_msgs/Odometry' in said
-    assert f'/sonar: {COUNT} sensor_msgs/msg/Range' in said
+def test_bag_without_odometry_is_rejected(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    error = error_of_drive(capsys, tmp_path, tape()._replace(odometry=[]))
+    assert 'no nav_msgs/Odometry' in error
+    assert f'/sonar: {COUNT} sensor_msgs/msg/Range' in error
 
 
-def test_several_odometry_topics(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_several_odometry_topics_require_a_choice(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     odometry = [m._replace(frame_id=frame) for m in tape().odometry for frame in ('map', 'odom')]
     bag = write_tape(
         tmp_path / 'bag', tape()._replace(odometry=odometry), odometry_topic=lambda m: f'/{m.frame_id}/pose'
     )
-    said = refusal(capsys, tmp_path, bag, '-o', tmp_path / 'maps')
-    assert '--odom-topic' in said
+    error = error_of(capsys, tmp_path, bag, '-o', tmp_path / 'maps')
+    assert '--odom-topic' in error
     for frame in ('map', 'odom'):
-        assert f'/{frame}/pose: {len(odometry) // 2} messages, {frame} → base_link' in said
+        assert f'/{frame}/pose: {len(odometry) // 2} messages, {frame} → base_link' in error
 
 
 @pytest.mark.parametrize(
@@ -168,41 +168,45 @@ def test_several_odometry_topics(tmp_path: Path, capsys: pytest.CaptureFixture[s
         (['--range-topics', '/odom'], '/odom.*has the type nav_msgs/msg/Odometry.*: /sonar'),
     ],
 )
-def test_topics_that_are_not_there(
+def test_unknown_topic_is_rejected_with_those_that_exist(
     tmp_path: Path, plain: Path, capsys: pytest.CaptureFixture[str], options: list[str], expected: str
 ) -> None:
-    said = refusal(capsys, tmp_path, plain / 'bag', '-o', tmp_path / 'maps', *options)
-    assert re.search(expected, said), said
+    error = error_of(capsys, tmp_path, plain / 'bag', '-o', tmp_path / 'maps', *options)
+    assert re.search(expected, error), error
 
 
 # ---- poses
 
 
-def test_no_frame_has_a_pose(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    said = refused_drive(capsys, tmp_path, tape()._replace(extrinsics=()))
-    assert all(frame in said for frame in FRAMES)
-    assert 'no /tf_static' in said and f'--sensor {FRAMES[0]}=x,y,yaw' in said and f'sensors.{FRAMES[0]}.pose' in said
-    assert 'of a split bag the first file has it, so give the whole folder' in said
+def test_drive_without_any_sensor_pose_is_rejected(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    error = error_of_drive(capsys, tmp_path, tape()._replace(extrinsics=()))
+    assert all(frame in error for frame in FRAMES)
+    assert (
+        'no /tf_static' in error and f'--sensor {FRAMES[0]}=x,y,yaw' in error and f'sensors.{FRAMES[0]}.pose' in error
+    )
+    assert 'of a split bag the first file has it, so give the whole folder' in error
 
 
-def test_a_bag_that_ends_with_a_range_is_told_the_same(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_drive_without_sensor_poses_that_ends_with_ranges_is_rejected(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     newest = max(message.stamp for message in tape().ranges)
     odometry = [message for message in tape().odometry if message.stamp < newest - 10**8]
-    said = refused_drive(capsys, tmp_path, tape()._replace(extrinsics=(), odometry=odometry))
-    assert said.startswith('no pose on the robot (frame ') and f'--sensor {FRAMES[0]}=x,y,yaw' in said
+    error = error_of_drive(capsys, tmp_path, tape()._replace(extrinsics=(), odometry=odometry))
+    assert error.startswith('no pose on the robot (frame ') and f'--sensor {FRAMES[0]}=x,y,yaw' in error
 
 
-def test_no_frame_has_a_pose_and_some_readings_are_rejected_for_another_reason(
+def test_drive_without_sensor_poses_and_with_bad_ranges_is_rejected(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     drive = tape()._replace(extrinsics=())
     first = drive.ranges[0]._replace(range=math.nan)
-    said = refused_drive(capsys, tmp_path, drive._replace(ranges=[first, *drive.ranges[1:]]))
-    assert 'nan_range' in said and all(frame in said for frame in FRAMES)
-    assert 'no /tf_static' in said and f'--sensor {FRAMES[0]}=x,y,yaw' in said
+    error = error_of_drive(capsys, tmp_path, drive._replace(ranges=[first, *drive.ranges[1:]]))
+    assert 'nan_range' in error and all(frame in error for frame in FRAMES)
+    assert 'no /tf_static' in error and f'--sensor {FRAMES[0]}=x,y,yaw' in error
 
 
-def test_names_that_would_write_on_the_terminal_are_rejected_and_shown_as_text(tmp_path: Path) -> None:
+def test_frame_with_control_characters_is_rejected_and_escaped(tmp_path: Path) -> None:
     drive = tape()
     bad = drive.ranges[0]._replace(frame_id='a\n\x1b[31mX')
     mapped(write_tape(tmp_path / 'bag', drive._replace(ranges=[bad, *drive.ranges[1:]])), tmp_path / 'maps')
@@ -211,33 +215,35 @@ def test_names_that_would_write_on_the_terminal_are_rejected_and_shown_as_text(t
     assert '\x1b' not in text
 
 
-def test_frames_that_do_not_join_the_robot(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    said = refused_drive(capsys, tmp_path, tape().with_odometry(child_frame_id='base_footprint'))
-    assert 'base_footprint' in said and 'base_link' in said and '--sensor' in said
-    assert 'do not join it to base_link: publish that transform, or have odometry name base_link' in said
+def test_transforms_not_connected_to_the_base_are_rejected(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    error = error_of_drive(capsys, tmp_path, tape().with_odometry(child_frame_id='base_footprint'))
+    assert 'base_footprint' in error and 'base_link' in error and '--sensor' in error
+    assert 'do not join it to base_link: publish that transform, or have odometry name base_link' in error
 
 
-def test_frames_with_another_prefix_are_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_frames_with_another_prefix_are_named_in_the_error(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     drive = tape().with_odometry(child_frame_id='robot1/base_link')
-    said = refused_drive(capsys, tmp_path, drive)
-    assert 'The transforms have base_link, not robot1/base_link: set the same prefix' in said
+    error = error_of_drive(capsys, tmp_path, drive)
+    assert 'The transforms have base_link, not robot1/base_link: set the same prefix' in error
     ranges = [m._replace(frame_id=f'robot1/{m.frame_id}') for m in drive.ranges]
     (tmp_path / 'all').mkdir()
-    said = refused_drive(capsys, tmp_path / 'all', drive._replace(ranges=ranges))
-    assert f'base_link, not robot1/base_link; {FRAMES[0]}, not robot1/{FRAMES[0]}' in said and 'and 6 more: set' in said
+    error = error_of_drive(capsys, tmp_path / 'all', drive._replace(ranges=ranges))
+    assert (
+        f'base_link, not robot1/base_link; {FRAMES[0]}, not robot1/{FRAMES[0]}' in error and 'and 6 more: set' in error
+    )
 
 
-def test_odometry_that_does_not_name_the_robot(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    said = refused_drive(capsys, tmp_path, tape().with_odometry(child_frame_id=''))
-    assert 'odometry has no child_frame_id' in said and '--sensor' in said
+def test_odometry_without_child_frame_is_rejected(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    error = error_of_drive(capsys, tmp_path, tape().with_odometry(child_frame_id=''))
+    assert 'odometry has no child_frame_id' in error and '--sensor' in error
 
 
-def test_stamps_that_nobody_filled_in(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    said = refused_drive(capsys, tmp_path, tape().with_ranges(stamp=0))
-    assert f'{COUNT} zero_stamp (header.stamp is 0: set it in the driver)' in said
+def test_stamps_of_zero_are_rejected_with_a_remedy(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    error = error_of_drive(capsys, tmp_path, tape().with_ranges(stamp=0))
+    assert f'{COUNT} zero_stamp (header.stamp is 0: set it in the driver)' in error
 
 
-def test_one_frame_without_a_pose_costs_only_its_readings(tmp_path: Path) -> None:
+def test_only_readings_of_a_sensor_without_pose_are_rejected(tmp_path: Path) -> None:
     bag = write_tape(tmp_path / 'bag', tape()._replace(extrinsics=tape().extrinsics[1:]))
     report = mapped(bag, tmp_path / 'maps')
     assert report['counts']['rejected'] == {'unknown_extrinsics': COUNT // len(FRAMES)}
@@ -251,10 +257,10 @@ def test_one_frame_without_a_pose_costs_only_its_readings(tmp_path: Path) -> Non
 
 
 class Unnormalised(BagWriter):
-    """Writes quaternions of odometry that are twice too long."""
+    """Writes odometry with quaternions of length 2."""
 
     def write_odometry(self, *arguments: Any, **options: Any) -> None:
-        """Write with other poses than anyone else."""
+        """Write a pose with a quaternion that is too long."""
         self._longer = 2.0
         super().write_odometry(*arguments, **options)
         self._longer = 1.0
@@ -266,15 +272,15 @@ class Unnormalised(BagWriter):
         return made
 
 
-def test_quaternions_that_are_not_normalised(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_quaternions_of_wrong_length_are_rejected(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     bag = write_tape(tmp_path / 'bag', tape(), writer=Unnormalised)
-    said = refusal(capsys, tmp_path, bag, '-o', tmp_path / 'maps')
-    assert f'all {COUNT} readings were rejected' in said
-    assert f'{len(tape().odometry)} odometry messages' in said and 'quaternion is not normalised' in said
-    assert 'cos(yaw/2)' in said and 'clocks' not in said
+    error = error_of(capsys, tmp_path, bag, '-o', tmp_path / 'maps')
+    assert f'all {COUNT} readings were rejected' in error
+    assert f'{len(tape().odometry)} odometry messages' in error and 'quaternion is not normalised' in error
+    assert 'cos(yaw/2)' in error and 'clocks' not in error
 
 
-def test_some_odometry_without_a_pose(tmp_path: Path) -> None:
+def test_odometry_without_pose_gives_a_warning(tmp_path: Path) -> None:
     odometry = [m._replace(pose=None) if k % 4 == 0 else m for k, m in enumerate(tape().odometry)]
     report = mapped(write_tape(tmp_path / 'bag', tape()._replace(odometry=odometry)), tmp_path / 'maps')
     assert report['counts']['accepted'] > 0.9 * COUNT
@@ -283,14 +289,14 @@ def test_some_odometry_without_a_pose(tmp_path: Path) -> None:
     assert any(f'{bad} of {len(odometry)} odometry' in w and 'quaternion' in w for w in report['warnings'])
 
 
-def test_odometry_of_two_robots_on_one_topic(tmp_path: Path) -> None:
+def test_odometry_of_two_robots_on_one_topic_gives_a_warning(tmp_path: Path) -> None:
     odometry = [m._replace(child_frame_id=child) for m in tape().odometry for child in ('base_link', 'other')]
     report = mapped(write_tape(tmp_path / 'bag', tape()._replace(odometry=odometry)), tmp_path / 'maps')
     assert report['counts']['rejected'] == {}
     assert any('child_frame_id' in w for w in report['warnings'])
 
 
-def test_frames_with_a_leading_slash(tmp_path: Path, plain: Path) -> None:
+def test_leading_slash_of_frames_is_ignored(tmp_path: Path, plain: Path) -> None:
     drive = tape().with_odometry(frame_id='/odom', child_frame_id='/base_link')
     drive = drive._replace(ranges=[m._replace(frame_id=f'/{m.frame_id}') for m in drive.ranges])
     bag = write_tape(tmp_path / 'ros1.bag', drive, 'ros1')
@@ -305,17 +311,19 @@ def test_frames_with_a_leading_slash(tmp_path: Path, plain: Path) -> None:
 # ---- stamps
 
 
-def test_stamps_that_do_not_overlap(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_ranges_and_odometry_that_do_not_overlap_are_rejected(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     hour = 3600 * SECOND
     for name, shift in (('early', -hour), ('late', hour)):
         odometry = [m._replace(stamp=m.stamp + shift) for m in tape().odometry]
         bag = write_tape(tmp_path / name, tape()._replace(odometry=odometry))
-        said = refusal(capsys, tmp_path, bag, '-o', tmp_path / 'maps')
-        assert 'do not overlap' in said and 'clock' in said
-        assert f'{tape().ranges[0].stamp / 1e9:.3f}' in said and f'{odometry[0].stamp / 1e9:.3f}' in said
+        error = error_of(capsys, tmp_path, bag, '-o', tmp_path / 'maps')
+        assert 'do not overlap' in error and 'clock' in error
+        assert f'{tape().ranges[0].stamp / 1e9:.3f}' in error and f'{odometry[0].stamp / 1e9:.3f}' in error
 
 
-def test_odometry_that_ends_early_and_has_a_gap(tmp_path: Path) -> None:
+def test_odometry_that_ends_early_and_has_a_gap_gives_warnings(tmp_path: Path) -> None:
     start = tape().odometry[0].stamp
     odometry = [m for m in tape().odometry if m.stamp < start + 10 * SECOND]
     odometry = [m for m in odometry if not start + 3 * SECOND < m.stamp < start + 6 * SECOND]
@@ -325,14 +333,14 @@ def test_odometry_that_ends_early_and_has_a_gap(tmp_path: Path) -> None:
 
 
 def shuffled(of: type[Message] | tuple[type[Message], ...]) -> list[tuple[int, Message]]:
-    """The messages of these types logged up to a second late, each by itself."""
+    """The messages; each of these types is logged up to a second late, at random."""
     generator = random.Random(1)
     late = [(time + (generator.randrange(SECOND) if isinstance(m, of) else 0), m) for time, m in in_turn(turning())]
     return sorted(late, key=lambda item: item[0])
 
 
 def turning() -> Tape:
-    """The drive with a robot that sways, so that a pose taken from the wrong messages would show."""
+    """The drive with a robot that turns to and fro, so that a pose from wrong messages is detected."""
     start = tape().odometry[0].stamp
     return tape()._replace(
         odometry=[
@@ -351,7 +359,7 @@ RANGE, ODOMETRY = type(tape().ranges[0]), type(tape().odometry[0])
         ODOMETRY,
     ],
 )
-def test_the_order_of_logging_does_not_matter(tmp_path: Path, late: type[Message]) -> None:
+def test_readings_do_not_depend_on_the_order_of_logging(tmp_path: Path, late: type[Message]) -> None:
     readings = []
     for name, logged in (('in_turn', in_turn(turning())), ('shuffled', shuffled(late))):
         bag = write_tape(tmp_path / name, turning(), logged=logged)
@@ -367,10 +375,12 @@ def test_the_order_of_logging_does_not_matter(tmp_path: Path, late: type[Message
 
 
 @pytest.mark.parametrize('angle', [0.0, -0.25, math.nan, 4.0])
-def test_a_field_of_view_that_cannot_be(tmp_path: Path, capsys: pytest.CaptureFixture[str], angle: float) -> None:
+def test_impossible_field_of_view_is_rejected_with_a_remedy(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], angle: float
+) -> None:
     drive = tape().with_ranges(field_of_view=angle)
-    said = refused_drive(capsys, tmp_path, drive)
-    assert f'{COUNT} bad_field_of_view' in said and 'set the parameter field_of_view to the full angle' in said
+    error = error_of_drive(capsys, tmp_path, drive)
+    assert f'{COUNT} bad_field_of_view' in error and 'set the parameter field_of_view to the full angle' in error
     right = tape().ranges[0].field_of_view
     report = mapped(tmp_path / 'bag', tmp_path / 'maps', '--set', f'field_of_view={right!r}')
     assert report['counts']['accepted'] == COUNT
@@ -390,11 +400,11 @@ def test_a_field_of_view_that_cannot_be(tmp_path: Path, capsys: pytest.CaptureFi
         ({'frame_id': ''}, 'empty_frame_id', 'no frame_id'),
     ],
 )
-def test_ranges_that_cannot_be(
+def test_impossible_ranges_are_rejected_with_reason(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], changes: dict[str, Any], reason: str, words: str
 ) -> None:
-    said = refused_drive(capsys, tmp_path, tape().with_ranges(**changes))
-    assert f'all {COUNT} readings were rejected' in said and reason in said and words in said
+    error = error_of_drive(capsys, tmp_path, tape().with_ranges(**changes))
+    assert f'all {COUNT} readings were rejected' in error and reason in error and words in error
     some = every(3, **changes)
     bad = sum(all(getattr(m, k) is v or getattr(m, k) == v for k, v in changes.items()) for m in some.ranges)
     report = mapped(write_tape(tmp_path / 'some', some), tmp_path / 'maps')
@@ -403,7 +413,7 @@ def test_ranges_that_cannot_be(
     assert reason in warning and words in warning
 
 
-def test_no_echo(tmp_path: Path) -> None:
+def test_drive_without_echoes_gives_a_map_without_walls(tmp_path: Path) -> None:
     bag = write_tape(tmp_path / 'bag', tape().with_ranges(range=math.inf))
     report = mapped(bag, tmp_path / 'maps')
     assert report['counts']['accepted'] == COUNT
@@ -412,22 +422,24 @@ def test_no_echo(tmp_path: Path) -> None:
     assert all(0 < k for k in (report['map']['width'], report['map']['height']))
 
 
-def test_no_echo_when_it_is_to_be_discarded(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    said = refused_drive(capsys, tmp_path, tape().with_ranges(range=math.inf), '--set', 'over_range=discard')
-    assert 'over_range' in said and 'discard' in said
+def test_drive_without_echoes_that_are_discarded_is_rejected(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    error = error_of_drive(capsys, tmp_path, tape().with_ranges(range=math.inf), '--set', 'over_range=discard')
+    assert 'over_range' in error and 'discard' in error
 
 
-def test_several_reasons_at_once(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_most_frequent_reason_comes_first(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     drive = tape().with_ranges(range=math.nan)
     drive = drive._replace(ranges=[m._replace(frame_id='') if k % 4 else m for k, m in enumerate(drive.ranges)])
-    said = refused_drive(capsys, tmp_path, drive)
-    assert said.index('empty_frame_id') < said.index('nan_range'), 'the most frequent comes first'
+    error = error_of_drive(capsys, tmp_path, drive)
+    assert error.index('empty_frame_id') < error.index('nan_range'), 'the most frequent comes first'
 
 
-def test_a_pose_from_another_planet(tmp_path: Path) -> None:
+def test_pose_at_ten_million_metres_is_rejected(tmp_path: Path) -> None:
     odometry = [m._replace(pose=Pose2(1e7, 0.0, 0.0)) if k > 900 else m for k, m in enumerate(tape().odometry)]
     report = mapped(write_tape(tmp_path / 'bag', tape()._replace(odometry=odometry)), tmp_path / 'maps')
-    # a reading of the very stamp of the jump has no pose to trust
+    # a reading with the stamp of the jump has no reliable pose
     assert set(report['counts']['rejected']) == {'far_from_map', 'pose_jump'}
     assert report['counts']['rejected']['pose_jump'] <= len(FRAMES)
     assert report['map']['width'] < 1000
@@ -452,12 +464,12 @@ def test_a_pose_from_another_planet(tmp_path: Path) -> None:
         (['--learn', '-1'], ['--learn', 'negative']),
     ],
 )
-def test_options_that_cannot_be(
+def test_impossible_option_is_rejected_with_reason(
     tmp_path: Path, plain: Path, capsys: pytest.CaptureFixture[str], options: list[str], expected: list[str]
 ) -> None:
-    said = refusal(capsys, tmp_path, plain / 'bag', '-o', tmp_path / 'maps', *options)
-    assert all(word in said for word in expected), said
-    assert '\n' not in said
+    error = error_of(capsys, tmp_path, plain / 'bag', '-o', tmp_path / 'maps', *options)
+    assert all(word in error for word in expected), error
+    assert '\n' not in error
 
 
 @pytest.mark.parametrize(
@@ -470,14 +482,14 @@ def test_options_that_cannot_be(
         (['--range-topics', ','], 'argument --range-topics: the name of a topic is expected'),
     ],
 )
-def test_command_lines_that_cannot_be(
+def test_wrong_command_line_is_rejected_with_exit_code_2(
     tmp_path: Path, plain: Path, capsys: pytest.CaptureFixture[str], options: list[str], expected: str
 ) -> None:
-    assert expected in refusal(capsys, tmp_path, plain / 'bag', *options, code=2)
+    assert expected in error_of(capsys, tmp_path, plain / 'bag', *options, code=2)
 
 
-def test_no_bag_given(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert 'bag' in refusal(capsys, tmp_path, code=2)
+def test_missing_bag_is_rejected_with_exit_code_2(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert 'bag' in error_of(capsys, tmp_path, code=2)
 
 
 @pytest.mark.parametrize(
@@ -495,30 +507,34 @@ def test_no_bag_given(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> Non
         ('p_hit: \x00', ['not valid YAML']),
     ],
 )
-def test_parameter_files_that_cannot_be(
+def test_bad_parameter_file_is_rejected_with_reason(
     tmp_path: Path, plain: Path, capsys: pytest.CaptureFixture[str], text: str, expected: list[str]
 ) -> None:
     file = tmp_path / 'p.yaml'
     file.write_text(text)
-    said = refusal(capsys, tmp_path, plain / 'bag', '-o', tmp_path / 'maps', '--params', file)
-    assert str(file) in said
-    assert all(word in said for word in expected), said
+    error = error_of(capsys, tmp_path, plain / 'bag', '-o', tmp_path / 'maps', '--params', file)
+    assert str(file) in error
+    assert all(word in error for word in expected), error
 
 
-def test_parameter_files_that_are_none(tmp_path: Path, plain: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_path_that_is_no_parameter_file_is_rejected(
+    tmp_path: Path, plain: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     picture = plain / 'maps' / 'maps.png'
     for path, expected in (
         (tmp_path / 'absent.yaml', 'cannot be read: No such file'),
         (tmp_path, 'cannot be read: Is a directory'),
         (picture, 'not valid YAML'),
     ):
-        said = refusal(capsys, tmp_path, plain / 'bag', '-o', tmp_path / 'maps', '--params', path)
-        assert str(path) in said and expected in said
+        error = error_of(capsys, tmp_path, plain / 'bag', '-o', tmp_path / 'maps', '--params', path)
+        assert str(path) in error and expected in error
 
 
-def test_a_file_cannot_excuse_a_setting(tmp_path: Path, plain: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_bad_setting_is_rejected_with_a_good_parameter_file(
+    tmp_path: Path, plain: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     (tmp_path / 'p.yaml').write_text('')
     options = ('--params', tmp_path / 'p.yaml', '--set', 'p_rand=-1')
-    assert 'p_rand' in refusal(capsys, tmp_path, plain / 'bag', '-o', tmp_path / 'maps', *options)
+    assert 'p_rand' in error_of(capsys, tmp_path, plain / 'bag', '-o', tmp_path / 'maps', *options)
     assert code_of(process_bag.main, plain / 'bag', '-q', '-o', tmp_path / 'maps', *options[:2]) == 0
     assert report_in(tmp_path / 'maps')['changed_parameters'] == {}

@@ -1,4 +1,4 @@
-"""Results appear whole or not at all, and never in place of something else."""
+"""Results appear complete or not at all, and never replace other files."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from drive_samples import FILES, code_of, everything_in, mapped, refusal, tape, write_tape
+from drive_samples import FILES, code_of, error_of, everything_in, mapped, tape, write_tape
 from rosbags import rosbag2
 
 from forward_grid_mapper.bags.writer import BagWriter
@@ -24,13 +24,13 @@ from forward_grid_mapper.core.search.search import Progress
 
 @pytest.fixture(scope='module')
 def bag(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A sound bag of the drive."""
+    """A correct bag of the drive."""
     return write_tape(tmp_path_factory.mktemp('plain') / 'bag', tape())
 
 
 @pytest.fixture
 def no_work(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Nothing is read: what is wrong with the output must be known before."""
+    """Fail if the bag is read: errors of the output must be detected before."""
 
     def refuse(*arguments: object, **options: object) -> None:
         raise AssertionError('the bag was read first')
@@ -39,7 +39,9 @@ def no_work(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.mark.usefixtures('no_work')
-def test_places_that_are_taken(tmp_path: Path, bag: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_existing_output_is_rejected_and_unchanged(
+    tmp_path: Path, bag: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     (tmp_path / 'mine.txt').write_text('mine')
     (tmp_path / 'link').symlink_to('nowhere')
     for path, expected in (
@@ -50,31 +52,33 @@ def test_places_that_are_taken(tmp_path: Path, bag: Path, capsys: pytest.Capture
         (tmp_path / 'mine.txt' / 'deep' / 'maps', 'a part of this path is a file'),
         (bag, 'exists and is not empty'),
     ):
-        said = refusal(capsys, tmp_path, bag, '-o', path)
-        assert str(path) in said and expected in said and '-o' in said
+        error = error_of(capsys, tmp_path, bag, '-o', path)
+        assert str(path) in error and expected in error and '-o' in error
     assert (tmp_path / 'mine.txt').read_text() == 'mine'
 
 
 @pytest.mark.usefixtures('no_work')
-def test_a_place_without_permission(
+def test_output_without_permission_is_rejected(
     tmp_path: Path, bag: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def refuse(self: Path, *arguments: object, **options: object) -> None:
         raise PermissionError(errno.EACCES, 'Permission denied')
 
     monkeypatch.setattr(Path, 'mkdir', refuse)
-    said = refusal(capsys, tmp_path, bag, '-o', tmp_path / 'new' / 'maps')
-    assert str(tmp_path / 'new' / 'maps') in said and 'no permission' in said and '-o' in said
+    error = error_of(capsys, tmp_path, bag, '-o', tmp_path / 'new' / 'maps')
+    assert str(tmp_path / 'new' / 'maps') in error and 'no permission' in error and '-o' in error
 
 
 @pytest.mark.skipif(os.geteuid() == 0, reason='permissions do not bind root')
-def test_a_place_without_permission_for_real(tmp_path: Path, bag: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_output_in_a_read_only_folder_is_rejected(
+    tmp_path: Path, bag: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     (tmp_path / 'locked').mkdir(mode=0o500)
-    assert 'no permission' in refusal(capsys, tmp_path, bag, '-o', tmp_path / 'locked' / 'maps')
+    assert 'no permission' in error_of(capsys, tmp_path, bag, '-o', tmp_path / 'locked' / 'maps')
 
 
 def full(*arguments: object, **options: object) -> None:
-    """Fail as every write to a full disk does."""
+    """Fail like a write to a full disk."""
     raise OSError(errno.ENOSPC, 'No space left on device')
 
 
@@ -83,7 +87,7 @@ def full(*arguments: object, **options: object) -> None:
     ('owner', 'name'),
     [(np, 'savez_compressed'), (Path, 'write_text'), (rosbag2.Writer, 'write'), (BagWriter, '__exit__')],
 )
-def test_a_full_disk(
+def test_full_disk_leaves_no_incomplete_results(
     tmp_path: Path,
     bag: Path,
     capsys: pytest.CaptureFixture[str],
@@ -97,18 +101,18 @@ def test_a_full_disk(
         output.mkdir()
     with monkeypatch.context() as patch:
         patch.setattr(owner, name, full)
-        said = refusal(capsys, tmp_path, bag, '-o', output, '--bag')
-    assert str(tmp_path) in said
-    assert 'disk is full' in said or 'No space left' in said
+        error = error_of(capsys, tmp_path, bag, '-o', output, '--bag')
+    assert str(tmp_path) in error
+    assert 'disk is full' in error or 'No space left' in error
     mapped(bag, output, '--bag')
     assert {path.name for path in output.iterdir()} == FILES | {'maps.mcap_bag'}
 
 
 @contextmanager
 def no_file_larger_than(size: int) -> Iterator[None]:
-    """Let no file grow beyond so many bytes: real failures of real writes."""
+    """Limit the size of files, so that real writes fail."""
     before = resource.getrlimit(resource.RLIMIT_FSIZE)
-    # the hard limit stays, without which the other could not be raised again
+    # the hard limit stays, otherwise the soft limit could not be raised again
     resource.setrlimit(resource.RLIMIT_FSIZE, (size, before[1]))
     try:
         yield
@@ -117,23 +121,23 @@ def no_file_larger_than(size: int) -> Iterator[None]:
 
 
 @pytest.mark.parametrize(('limit', 'name'), [(6_000, 'live_map.pgm'), (20_000, 'maps.npz')])
-def test_a_limit_on_the_size_of_files(
+def test_file_size_limit_leaves_no_incomplete_results(
     tmp_path: Path, bag: Path, capsys: pytest.CaptureFixture[str], limit: int, name: str
 ) -> None:
     with no_file_larger_than(limit):
-        said = refusal(capsys, tmp_path, bag, '-q', '-o', tmp_path / 'maps')
-    assert f'{name} cannot be written: File too large' in said
+        error = error_of(capsys, tmp_path, bag, '-q', '-o', tmp_path / 'maps')
+    assert f'{name} cannot be written: File too large' in error
     assert everything_in(tmp_path) == []
 
 
-def test_a_picture_that_cannot_be_written_costs_only_itself(
+def test_picture_that_cannot_be_written_is_left_out(
     tmp_path: Path, bag: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     with no_file_larger_than(60_000):
         assert code_of(process_bag.main, bag, '-q', '-o', tmp_path / 'maps') == 0
-    said = capsys.readouterr().err
-    assert 'warning: no picture was drawn: ' in said and 'File too large' in said
-    assert 'warning: report.html was not written: ' in said
+    error = capsys.readouterr().err
+    assert 'warning: no picture was drawn: ' in error and 'File too large' in error
+    assert 'warning: report.html was not written: ' in error
     assert {path.name for path in (tmp_path / 'maps').iterdir()} == FILES - {'maps.png', 'report.html'}
 
 
@@ -143,7 +147,7 @@ def interrupt(*arguments: object, **options: object) -> None:
 
 
 def during_the_search(self: Ticker, stage: str, progress: Progress | None) -> None:
-    """Press Ctrl-C when the search has made its first sweep."""
+    """Interrupt after the first sweep of the search."""
     if progress is not None:
         interrupt()
 
@@ -158,7 +162,7 @@ def during_the_search(self: Ticker, stage: str, progress: Progress | None) -> No
         (BagWriter, 'write_grid', interrupt),
     ],
 )
-def test_ctrl_c(
+def test_ctrl_c_leaves_no_files(
     tmp_path: Path,
     bag: Path,
     capsys: pytest.CaptureFixture[str],
@@ -178,7 +182,7 @@ def test_ctrl_c(
     assert everything_in(tmp_path) == before
 
 
-def test_a_folder_that_came_up_meanwhile(
+def test_output_folder_created_meanwhile_is_kept(
     tmp_path: Path, bag: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def meanwhile(*arguments: object, **options: object) -> Any:

@@ -1,4 +1,4 @@
-"""Commands that are started without standard streams, as some daemons start them."""
+"""Commands started without standard streams, as some daemons do."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ print(*(os.readlink(f'/proc/self/fd/{number}') for number in (0, 1, 2)), file=op
 
 
 def started(closed: str, *words: object) -> subprocess.CompletedProcess[str]:
-    """Run Python by a shell that closes some streams."""
+    """Run Python in a shell that closes some streams."""
     command = ' '.join(['exec "$@"', closed])
     return subprocess.run(
         ['/bin/sh', '-c', command, 'sh', sys.executable, *map(str, words)],
@@ -30,7 +30,7 @@ def started(closed: str, *words: object) -> subprocess.CompletedProcess[str]:
 
 
 @pytest.mark.parametrize('closed', ['>&-', '2>&-', '<&- >&- 2>&-'])
-def test_a_command_does_its_work(tmp_path: Path, closed: str) -> None:
+def test_command_works_with_closed_streams(tmp_path: Path, closed: str) -> None:
     folder = tmp_path / 'drive'
     done = started(closed, '-m', 'forward_grid_mapper', 'simulate', 'door', '--seen', 1, '-o', folder)
     assert (done.returncode, done.stderr) == (0, '')
@@ -38,7 +38,7 @@ def test_a_command_does_its_work(tmp_path: Path, closed: str) -> None:
     assert ('readings' in done.stdout) == ('>&-' not in closed.split())
 
 
-def test_an_error_has_its_exit_code(tmp_path: Path) -> None:
+def test_error_has_its_exit_code_with_closed_streams(tmp_path: Path) -> None:
     done = started('>&-', '-m', 'forward_grid_mapper', 'process_bag', tmp_path / 'absent', '-o', tmp_path / 'maps')
     assert done.returncode == 1
     assert done.stderr.startswith('process_bag: error: ') and done.stderr.count('\n') == 1
@@ -47,14 +47,14 @@ def test_an_error_has_its_exit_code(tmp_path: Path) -> None:
         assert (done.returncode, done.stderr) == (0, '')
 
 
-def test_no_file_of_ours_takes_the_place_of_a_stream(tmp_path: Path) -> None:
-    """What a library writes to standard output would be written into it."""
+def test_closed_streams_are_replaced_by_dev_null(tmp_path: Path) -> None:
+    """Otherwise the first file that the command opens would receive what libraries print."""
     report = tmp_path / 'report'
     started('<&- >&- 2>&-', '-c', PLACES, report)
     assert report.read_text().split() == ['/dev/null'] * 3
 
 
-def test_json_of_nobody(tmp_path: Path) -> None:
+def test_json_with_closed_output_succeeds(tmp_path: Path) -> None:
     bag = write_tape(tmp_path / 'bag', tape())
     done = started('>&-', '-m', 'forward_grid_mapper', 'process_bag', bag, '-o', tmp_path / 'maps', '--json', '-q')
     assert done.returncode == 0 and 'Traceback' not in done.stderr

@@ -1,4 +1,4 @@
-"""What makes command lines pleasant: JSON, viewers, examples in every help, and tab completion."""
+"""JSON output, viewers, examples in the help, and tab completion."""
 
 from __future__ import annotations
 
@@ -29,13 +29,13 @@ PARSED = [name for name in COMMANDS if name != 'mapper']
 
 @pytest.fixture(autouse=True)
 def no_picture(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Drawing takes most of the time of a run, and no part in these tests."""
+    """Do not draw: it takes most of the time of a run and is not needed here."""
     monkeypatch.setattr(drawing, 'draw', lambda path, picture: None)
 
 
 @pytest.fixture(scope='module')
 def bag(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A sound bag of the drive."""
+    """A correct bag of the drive."""
     return write_tape(tmp_path_factory.mktemp('plain') / 'bag', tape())
 
 
@@ -45,7 +45,7 @@ def parser_of(command: str) -> argparse.ArgumentParser:
 
 
 @pytest.mark.parametrize('encoding', ['utf-8', 'ascii', 'latin-1'])
-def test_json_is_utf_8_in_every_locale(encoding: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_json_is_utf_8_in_any_locale(encoding: str, monkeypatch: pytest.MonkeyPatch) -> None:
     data = {'bag': 'Büro – 中文 𝄞'}
     written = io.BytesIO()
     monkeypatch.setattr(sys, 'stdout', io.TextIOWrapper(written, encoding, errors='backslashreplace'))
@@ -55,9 +55,7 @@ def test_json_is_utf_8_in_every_locale(encoding: str, monkeypatch: pytest.Monkey
 
 
 @pytest.mark.parametrize('command', PARSED)
-def test_every_help_has_an_example_that_is_understood(
-    command: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_help_has_an_example_that_is_parsed(command: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     (tmp_path / 'MY_BAG').mkdir()
     example = re.search(rf'^example: {command}\b([^.]*(?:\.\w[^.]*)*)', parser_of(command).epilog or '')
@@ -65,25 +63,25 @@ def test_every_help_has_an_example_that_is_understood(
     parser_of(command).parse_args(shlex.split(example[1]))
 
 
-def test_the_node_has_an_example() -> None:
+def test_help_of_the_node_has_an_example() -> None:
     assert 'example: mapper --ros-args' in USAGE
 
 
-def test_json_is_the_report_and_nothing_else(tmp_path: Path, bag: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_json_prints_only_the_report(tmp_path: Path, bag: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert code_of(process_bag.main, bag, '-o', tmp_path / 'maps', '--json') == 0
-    said = json.loads(capsys.readouterr().out)
-    assert said.pop('folder') == str(tmp_path / 'maps')
-    assert said == report_in(tmp_path / 'maps')
+    report = json.loads(capsys.readouterr().out)
+    assert report.pop('folder') == str(tmp_path / 'maps')
+    assert report == report_in(tmp_path / 'maps')
 
 
-def test_json_prints_nothing_if_it_fails(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_json_prints_nothing_after_an_error(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert code_of(process_bag.main, tmp_path / 'absent', '-o', tmp_path / 'maps', '--json') == 1
     out, err = capsys.readouterr()
     assert out == '' and err.startswith('process_bag: error: ')
 
 
 def viewer(folder: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """A desktop whose viewer notes what it is given; return the file of its notes."""
+    """A desktop whose viewer writes its argument to a file; return that file."""
     notes, program = folder / 'notes', folder / 'xdg-open'
     os.mkfifo(notes)
     program.write_text(f'#!/bin/sh\necho "$1" > {shlex.quote(str(notes))}\n')
@@ -99,7 +97,7 @@ def test_show_opens_the_report(
 ) -> None:
     notes = viewer(tmp_path, monkeypatch)
     assert code_of(process_bag.main, bag, '-q', '-o', tmp_path / 'maps', '--show') == 0
-    # the pipe waits for the viewer to write
+    # the named pipe waits for the viewer to write
     assert notes.read_text() == f'{tmp_path / "maps" / "report.html"}\n'
     assert 'no desktop' not in capsys.readouterr().err
 
@@ -111,7 +109,7 @@ def test_show_opens_the_report(
         (demo.main, ['--offline', '--seen', 1, '--show'], 'demo.png'),
     ],
 )
-def test_show_opens_pictures(
+def test_show_opens_the_picture(
     tmp_path: Path, main: Any, words: list[str], picture: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     shown = []
@@ -121,7 +119,7 @@ def test_show_opens_pictures(
     assert shown == [tmp_path / 'out' / picture] and shown[0].exists()
 
 
-def test_show_opens_a_figure_of_several(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_show_opens_one_figure_of_several(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def draw(folder: Path, *rest: Any) -> str:
         for name in ('rooms', 'corridor'):
             (folder / f'figure_{name}.png').touch()
@@ -134,7 +132,7 @@ def test_show_opens_a_figure_of_several(tmp_path: Path, monkeypatch: pytest.Monk
     assert shown == [tmp_path / 'out' / 'figure_corridor.png']
 
 
-def test_without_a_desktop_show_says_what_to_open(
+def test_show_without_a_desktop_prints_the_address(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     for name in ('DISPLAY', 'WAYLAND_DISPLAY'):
@@ -145,7 +143,7 @@ def test_without_a_desktop_show_says_what_to_open(
     assert page.as_uri() in capsys.readouterr().err
 
 
-def test_rerun_writes_the_drive_and_says_how_to_play_it(
+def test_rerun_writes_the_drive_and_prints_the_viewer_command(
     tmp_path: Path, bag: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     pytest.importorskip('rerun', reason='the extra rerun is not installed')
@@ -153,12 +151,12 @@ def test_rerun_writes_the_drive_and_says_how_to_play_it(
     line = capsys.readouterr().out.splitlines()[-1]
     words = shlex.split(line)
     assert words[1:] == ['-m', 'rerun', str(tmp_path / 'my maps' / 'drive.rrd')]
-    # its viewer needs a screen, what checks a file does not
+    # the viewer needs a screen, the check of a file does not
     done = subprocess.run([*words[:3], 'rrd', 'verify', words[3]], capture_output=True, check=False)
     assert done.returncode == 0, done.stderr
 
 
-def test_without_rerun_nothing_is_begun(
+def test_missing_rerun_is_reported_before_the_work(
     tmp_path: Path, bag: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setitem(sys.modules, 'rerun', None)
@@ -167,7 +165,7 @@ def test_without_rerun_nothing_is_begun(
     assert not (tmp_path / 'maps').exists()
 
 
-def test_commands_and_their_options_are_completed() -> None:
+def test_commands_and_options_are_completed() -> None:
     made = completion.parser_of_all(COMMANDS, 'forward_grid_mapper', ['forward_grid_mapper', 'learn', '--ro'])
     (below,) = [action for action in made._actions if isinstance(action, argparse._SubParsersAction)]
     assert set(below.choices) == set(COMMANDS)
@@ -179,7 +177,7 @@ def test_commands_and_their_options_are_completed() -> None:
     ('line', 'expected'),
     [('forward_grid_mapper pro', ['process_bag']), ('forward_grid_mapper learn --roun', ['--rounds'])],
 )
-def test_the_shell_gets_completions(tmp_path: Path, line: str, expected: list[str]) -> None:
+def test_completions_are_returned_to_the_shell(tmp_path: Path, line: str, expected: list[str]) -> None:
     pytest.importorskip('argcomplete')
     answer = tmp_path / 'answer'
     environment = {

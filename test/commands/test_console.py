@@ -1,4 +1,4 @@
-"""The command line from outside: exit codes, pipes, terminals, and the progress line."""
+"""The command line as a process: exit codes, pipes, terminals, and the progress line."""
 
 from __future__ import annotations
 
@@ -27,21 +27,21 @@ MODULE = [sys.executable, '-m', 'forward_grid_mapper']
 
 @pytest.fixture(scope='module')
 def bag(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A sound bag of the drive."""
+    """A correct bag of the drive."""
     return write_tape(tmp_path_factory.mktemp('plain') / 'bag', tape())
 
 
 def shell(*arguments: object, **environment: str) -> subprocess.CompletedProcess[str]:
-    """Run the module in a process of its own, with stdout buffered as it is for users."""
+    """Run the module in a separate process, with stdout buffered as for users."""
     inherited = {k: v for k, v in os.environ.items() if k != 'PYTHONUNBUFFERED'}
     command = [*MODULE, *map(str, arguments)]
     return subprocess.run(command, capture_output=True, text=True, check=False, env={**inherited, **environment})
 
 
-# ---- from outside
+# ---- as a process
 
 
-def test_usage() -> None:
+def test_usage_and_unknown_commands() -> None:
     helped = shell('--help')
     assert (helped.returncode, helped.stderr) == (0, '')
     assert all(re.search(rf'^  {name} ', helped.stdout, re.MULTILINE) for name in COMMANDS)
@@ -56,8 +56,8 @@ def test_usage() -> None:
 
 @pytest.mark.parametrize('unbuffered', ['', '1'])
 @pytest.mark.parametrize('arguments', [('--help',), ('--version',), ('mapper', '--help'), ('process_bag', '--help')])
-def test_whoever_reads_the_output_may_go_before_its_end(arguments: tuple[str, ...], unbuffered: str) -> None:
-    """As `head` does."""
+def test_closed_output_pipe_gives_no_traceback(arguments: tuple[str, ...], unbuffered: str) -> None:
+    """As with `head`."""
     reader, writer = os.pipe()
     os.close(reader)
     command = [*MODULE, *arguments]
@@ -71,11 +71,11 @@ def test_whoever_reads_the_output_may_go_before_its_end(arguments: tuple[str, ..
             env={**os.environ, 'PYTHONUNBUFFERED': unbuffered},
         )
     assert done.stderr == ''
-    # argparse takes it for nothing at all where nothing is buffered
+    # without buffering, argparse ignores the error
     assert done.returncode in (0, 1)
 
 
-def test_a_pipe_that_broke_elsewhere_is_no_reader_who_went() -> None:
+def test_broken_pipe_elsewhere_is_an_error() -> None:
     def fail() -> int:
         raise BrokenPipeError('somewhere else')
 
@@ -86,23 +86,21 @@ def test_a_pipe_that_broke_elsewhere_is_no_reader_who_went() -> None:
 
 @pytest.mark.parametrize('command', ['process_bag', 'learn', 'replay_bag', 'simulate', 'demo'])
 @pytest.mark.parametrize('arguments', [('--help',), ()])
-def test_a_command_without_its_packages_says_what_brings_them(
-    tmp_path: Path, command: str, arguments: tuple[str, ...]
-) -> None:
-    # found before the real one
+def test_missing_package_is_reported_with_the_extra(tmp_path: Path, command: str, arguments: tuple[str, ...]) -> None:
+    # found before the real package
     (tmp_path / 'rosbags.py').write_text('raise ModuleNotFoundError("no", name="rosbags.rosbag1")\n')
-    said = shell(command, *arguments, PYTHONPATH=str(tmp_path))
-    assert said.returncode == 1
-    assert said.stderr.startswith(f'{command}: error: rosbags is not installed: pip install')
-    assert '[offline]' in said.stderr and 'Traceback' not in said.stderr
+    done = shell(command, *arguments, PYTHONPATH=str(tmp_path))
+    assert done.returncode == 1
+    assert done.stderr.startswith(f'{command}: error: rosbags is not installed: pip install')
+    assert '[offline]' in done.stderr and 'Traceback' not in done.stderr
 
 
-def test_a_module_that_no_extra_brings_is_no_matter_of_installation(tmp_path: Path) -> None:
+def test_missing_module_of_no_extra_raises(tmp_path: Path) -> None:
     (tmp_path / 'rosbags.py').write_text('import absent_from_everywhere\n')
     assert 'Traceback' in shell('process_bag', '--help', PYTHONPATH=str(tmp_path)).stderr
 
 
-def test_from_simulation_to_maps(tmp_path: Path) -> None:
+def test_simulated_drive_is_mapped_by_the_printed_command(tmp_path: Path) -> None:
     simulated = shell('simulate', 'door', '--seen', 1, '-o', tmp_path / 'drive', '--sonars', 'front')
     assert simulated.returncode == 0, simulated.stderr
     command = simulated.stdout.splitlines()[-1].split()
@@ -119,8 +117,8 @@ def test_errors_are_one_line(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_a_reader_that_goes_away(tmp_path: Path, bag: Path) -> None:
-    """As `process_bag … | head` and `| true` do."""
+def test_reader_that_closes_the_pipe_does_not_stop_the_maps(tmp_path: Path, bag: Path) -> None:
+    """As with `process_bag … | head` and `| true`."""
     for arguments in (['--list-parameters'], [str(bag), '-o', str(tmp_path / 'maps')]):
         for unbuffered in ('', '1') if len(arguments) == 1 else ('',):
             reader, writer = os.pipe()
@@ -138,7 +136,7 @@ def test_a_reader_that_goes_away(tmp_path: Path, bag: Path) -> None:
 
 @pytest.mark.skipif(not Path('/dev/full').exists(), reason='there is no /dev/full')
 @pytest.mark.parametrize('unbuffered', ['', '1'])
-def test_output_that_cannot_be_printed(tmp_path: Path, bag: Path, unbuffered: str) -> None:
+def test_full_standard_output_is_reported(tmp_path: Path, bag: Path, unbuffered: str) -> None:
     environment = {**os.environ, 'PYTHONUNBUFFERED': unbuffered}
     for arguments in (['--list-parameters'], [str(bag), '-q', '-o', str(tmp_path / 'maps')]):
         with Path('/dev/full').open('w') as full:
@@ -149,13 +147,13 @@ def test_output_that_cannot_be_printed(tmp_path: Path, bag: Path, unbuffered: st
 
 
 @pytest.mark.slow
-def test_a_terminal_that_cannot_show_a_name(tmp_path: Path, bag: Path) -> None:
+def test_name_that_the_terminal_cannot_show_is_escaped(tmp_path: Path, bag: Path) -> None:
     done = shell('process_bag', bag, '-q', '-o', tmp_path / 'maps–日本', PYTHONIOENCODING='latin-1')
     assert done.returncode == 0, done.stderr
     assert done.stdout.endswith('maps\\u2013\\u65e5\\u672c\n')
 
 
-def test_a_working_directory_that_is_gone(tmp_path: Path, bag: Path) -> None:
+def test_deleted_working_directory_is_reported(tmp_path: Path, bag: Path) -> None:
     folder = tmp_path / 'gone'
     folder.mkdir()
     script = f'rmdir "{folder}" && exec "$@"'
@@ -163,11 +161,11 @@ def test_a_working_directory_that_is_gone(tmp_path: Path, bag: Path) -> None:
     environment = {**os.environ, 'PYTHONPATH': os.pathsep.join(filter(None, map(os.path.abspath, sys.path)))}
     done = subprocess.run(command, cwd=folder, capture_output=True, text=True, check=False, env=environment)
     assert done.returncode == 1
-    said = 'process_bag: error: the working directory does not exist any more; change to one that does'
-    assert done.stderr.splitlines()[-1] == said and 'Traceback' not in done.stderr
+    expected = 'process_bag: error: the working directory does not exist any more; change to one that does'
+    assert done.stderr.splitlines()[-1] == expected and 'Traceback' not in done.stderr
 
 
-def test_a_locale_without_the_letters_of_a_name(tmp_path: Path, bag: Path) -> None:
+def test_name_is_kept_in_an_ascii_locale(tmp_path: Path, bag: Path) -> None:
     (tmp_path / 'größe').symlink_to(bag)
     ascii_only = {'LC_ALL': 'C', 'PYTHONUTF8': '0', 'PYTHONCOERCECLOCALE': '0'}
     done = shell('process_bag', tmp_path / 'größe', '-q', '-o', tmp_path / 'maps', **ascii_only)
@@ -186,7 +184,7 @@ def test_a_locale_without_the_letters_of_a_name(tmp_path: Path, bag: Path) -> No
         (KeyboardInterrupt(), 130, 'nothing was written'),
     ],
 )
-def test_what_may_still_happen(
+def test_unexpected_errors_give_one_line_and_an_exit_code(
     capsys: pytest.CaptureFixture[str], error: BaseException, code: int, expected: str
 ) -> None:
     def body(options: object) -> int:
@@ -199,7 +197,7 @@ def test_what_may_still_happen(
     assert capsys.readouterr().out == 'still printing\n'
 
 
-def test_errors_of_ours_are_not_hidden() -> None:
+def test_programming_error_is_raised() -> None:
     def body(options: object) -> int:
         raise ZeroDivisionError
 
@@ -207,10 +205,10 @@ def test_errors_of_ours_are_not_hidden() -> None:
         console.run(process_bag.parser(), body, ['bag'])
 
 
-def test_readable(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_readable_text_of_a_path(monkeypatch: pytest.MonkeyPatch) -> None:
     assert readable(Path('Büro 日本')) == readable(readable(Path('Büro 日本'))) == 'Büro 日本'
     assert readable(os.fsdecode(b'n\xfft')) == r'n\xfft'
-    # as where names of files are ASCII
+    # as if names of files were ASCII
     monkeypatch.setattr(os, 'fsencode', lambda path: str(path).encode('ascii', 'surrogateescape'))
     name = 'Büro'.encode().decode('ascii', 'surrogateescape')
     assert readable(name) == readable(readable(name)) == 'Büro'
@@ -220,14 +218,14 @@ def test_readable(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 class Screen(io.StringIO):
-    """A terminal."""
+    """A stream that is a terminal."""
 
     def isatty(self) -> bool:
-        """Say yes."""
+        """Return True."""
         return True
 
 
-def test_silent_under_a_second() -> None:
+def test_work_below_a_second_shows_no_progress() -> None:
     for stream in (io.StringIO(), Screen()):
         with Ticker(stream=stream) as ticker:
             ticker.say('working')
@@ -235,7 +233,7 @@ def test_silent_under_a_second() -> None:
         assert stream.getvalue() == ''
 
 
-def test_shows_longer_work(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_longer_work_shows_progress(monkeypatch: pytest.MonkeyPatch) -> None:
     for name in ('PATIENCE', 'ON_SCREEN', 'IN_LOG'):
         monkeypatch.setattr(console, name, 0.05)
     streams = {'log': io.StringIO(), 'screen': Screen(), 'quiet': Screen(), 'idle': Screen()}
@@ -263,7 +261,7 @@ def test_shows_longer_work(monkeypatch: pytest.MonkeyPatch) -> None:
     assert '\n' not in shown['screen']
 
 
-def test_long_work_says_what_is_wrong_with_its_input(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_warnings_are_printed_during_long_work(monkeypatch: pytest.MonkeyPatch) -> None:
     for name in ('PATIENCE', 'LONG', 'ON_SCREEN', 'IN_LOG'):
         monkeypatch.setattr(console, name, 0.05)
     log, screen, quiet = io.StringIO(), Screen(), io.StringIO()
@@ -283,7 +281,7 @@ def test_long_work_says_what_is_wrong_with_its_input(monkeypatch: pytest.MonkeyP
     assert quiet.getvalue() == ''
 
 
-def test_short_work_leaves_warnings_to_the_report() -> None:
+def test_warnings_are_not_printed_during_short_work() -> None:
     stream = io.StringIO()
     with Ticker(stream=stream) as ticker:
         ticker.warn(['max_range is 400 m'])
@@ -299,7 +297,7 @@ def wait_until_shown(stream: io.StringIO, text: str, begin: int = 0) -> None:
         time.sleep(0.01)
 
 
-def test_says_that_it_compiles_only_while_it_does(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_compilation_is_shown_only_while_compiling(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(console, 'PATIENCE', 0.0)
     stream = Screen()
     with Ticker(stream=stream) as ticker:
@@ -314,7 +312,7 @@ def test_says_that_it_compiles_only_while_it_does(monkeypatch: pytest.MonkeyPatc
         assert 'uncertainty (compil' not in stream.getvalue()
 
 
-def test_quiet_says_once_that_it_compiles(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_quiet_mentions_compilation_once(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(console, 'PATIENCE', 0.0)
     stream = io.StringIO()
     with Ticker(quiet=True, stream=stream) as ticker:
@@ -328,11 +326,11 @@ def test_quiet_says_once_that_it_compiles(monkeypatch: pytest.MonkeyPatch) -> No
 
 
 def compiling_begun() -> AbstractContextManager[None]:
-    """The event that numba triggers around a compilation, and not for what it finds in its cache."""
+    """The event that numba triggers around a compilation, but not when a kernel comes from the cache."""
     return event.trigger_event('numba:compile')
 
 
-def test_compiling_is_noticed_and_the_cache_is_not(tmp_path: Path) -> None:
+def test_compilation_is_detected_and_loading_from_the_cache_is_not(tmp_path: Path) -> None:
     program = """
 import sys, numba
 from numba.core import event
@@ -357,7 +355,7 @@ print(compiling.count() - before)
 
 
 @pytest.mark.parametrize('columns', [20, 40, 80])
-def test_a_line_never_wraps(monkeypatch: pytest.MonkeyPatch, columns: int) -> None:
+def test_progress_line_fits_the_terminal(monkeypatch: pytest.MonkeyPatch, columns: int) -> None:
     monkeypatch.setattr(console, 'PATIENCE', 0.0)
     monkeypatch.setenv('COLUMNS', str(columns))
     stream = Screen()
@@ -368,13 +366,13 @@ def test_a_line_never_wraps(monkeypatch: pytest.MonkeyPatch, columns: int) -> No
     assert max(map(len, lines)) == columns - 1
 
 
-def test_shortened() -> None:
+def test_shortened_text() -> None:
     assert console.shortened('as it is', 8) == 'as it is'
     assert console.shortened('too long for it', 8) == 'too l...'
     assert [len(console.shortened('too long', width)) for width in range(-1, 9)] == [0, 0, 1, 2, 3, 4, 5, 6, 7, 8]
 
 
-def test_a_pipe_gets_a_line_a_second_at_most(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_progress_in_a_pipe_is_one_line_a_second_at_most(monkeypatch: pytest.MonkeyPatch) -> None:
     assert console.IN_LOG == 1.0
     monkeypatch.setattr(console, 'PATIENCE', 0.0)
     monkeypatch.setattr(console, 'IN_LOG', 0.2)
@@ -388,7 +386,7 @@ def test_a_pipe_gets_a_line_a_second_at_most(monkeypatch: pytest.MonkeyPatch) ->
     assert 1 <= len(stream.getvalue().splitlines()) <= passed / 0.2
 
 
-def test_ends_at_an_error(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_progress_ends_at_an_error(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(console, 'PATIENCE', 0.0)
     stream = Screen()
     with pytest.raises(KeyboardInterrupt), Ticker(stream=stream) as ticker:

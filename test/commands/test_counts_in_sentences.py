@@ -1,4 +1,4 @@
-"""One of a thing is told in the singular."""
+"""Counts in messages: singular for one, plural otherwise."""
 
 from __future__ import annotations
 
@@ -15,18 +15,18 @@ from forward_grid_mapper.files.picture import figures_text
 from forward_grid_mapper.files.report_text import report_text
 
 
-def test_counts() -> None:
+def test_count_with_singular_or_plural() -> None:
     assert counted(1, 'reading') == '1 reading'
     assert counted(0, 'reading') == '0 readings'
     assert counted(1234, 'reading', ',') == '1,234 readings'
 
 
-def test_messages_that_were_skipped() -> None:
+def test_message_about_skipped_messages() -> None:
     assert skipped(1, '/a') == '1 message on /a does not fit its type and was skipped'
     assert skipped(2, '/a') == '2 messages on /a do not fit their type and were skipped'
 
 
-def test_the_report_and_the_picture() -> None:
+def test_counts_in_report_and_picture() -> None:
     one = report_text({'result': {'readings': 40, 'unexplained': 1}})
     assert '1 reading (2.5 %) is most likely a random measurement\n' in one
     several = report_text({'result': {'readings': 40, 'unexplained': 2}})
@@ -35,10 +35,10 @@ def test_the_report_and_the_picture() -> None:
 
 
 @pytest.mark.parametrize('seeds', [1, 2])
-def test_seeds_of_an_experiment(monkeypatch: pytest.MonkeyPatch, seeds: int) -> None:
-    """Settings of the standard map are tried with as many drives as there are, two at the most."""
+def test_number_of_seeds_in_the_table_of_an_experiment(monkeypatch: pytest.MonkeyPatch, seeds: int) -> None:
+    """Settings of the standard map are tried with all drives, but with two at most."""
     monkeypatch.setattr(experiment_maps, 'GAINS', experiment_maps.GAINS[:1])
-    # a short one will do
+    # a short drive is enough
     monkeypatch.setattr(experiment_maps, 'corridor_drive', experiment_maps.passing_drive)
     for made in (experiment_maps.passer_by, experiment_maps.corridor):
         options = argparse.Namespace(seeds=seeds)

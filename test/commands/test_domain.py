@@ -1,4 +1,4 @@
-"""A DDS domain that nobody else has."""
+"""A DDS domain that no other process uses."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from forward_grid_mapper.commands.domain import own_domain
 from forward_grid_mapper.core.common.errors import MapperError
 
 
-def test_domains_that_are_held_at_once_differ_and_come_back(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_reserved_domains_differ_and_are_released(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(domain, 'LAST', 3)
     with ExitStack() as stack:
         with own_domain() as one, own_domain() as other:
@@ -29,7 +29,7 @@ def test_domains_that_are_held_at_once_differ_and_come_back(monkeypatch: pytest.
             assert again in (one, other)
 
 
-def test_a_domain_with_a_participant_is_passed_over() -> None:
+def test_domain_with_a_participant_is_skipped() -> None:
     with own_domain() as found:
         pass
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as participant:
@@ -38,7 +38,7 @@ def test_a_domain_with_a_participant_is_passed_over() -> None:
             assert other != found
 
 
-def test_the_port_of_a_participant_is_that_of_the_middleware(tmp_path: Path) -> None:
+def test_port_of_a_participant_is_that_of_the_middleware(tmp_path: Path) -> None:
     pytest.importorskip('rclpy', reason='rclpy is not installed (the extra ros, or a sourced ROS 2)')
     with own_domain() as found:
         environment = {**os.environ, 'ROS_DOMAIN_ID': str(found), 'ROS_AUTOMATIC_DISCOVERY_RANGE': 'LOCALHOST'}

@@ -1,4 +1,4 @@
-"""`experiment` and `demo`: they run, print a table and leave a picture."""
+"""`experiment` and `demo`: they run, print a table and write a picture."""
 
 from __future__ import annotations
 
@@ -20,12 +20,14 @@ PAPER_FILE = Path(__file__).parents[2] / 'config' / 'paper.yaml'
 
 @pytest.fixture(autouse=True)
 def few_gains(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The standard map has three settings instead of hundreds."""
+    """Try only three settings of the standard map instead of hundreds."""
     gains = experiment_maps.GAINS
     monkeypatch.setattr(experiment_maps, 'GAINS', gains[:: len(gains) // 3][:3])
 
 
-def test_door(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+def test_door_writes_a_table_and_a_figure(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
     monkeypatch.chdir(tmp_path)
     assert code_of(experiment.main, 'door', '--seeds', 1) == 0
     out = capsys.readouterr().out
@@ -47,7 +49,7 @@ def test_door(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.Ca
     assert everything_in(tmp_path) == sorted(map(str, (folder, *folder.iterdir())))
 
 
-def test_corridor(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_corridor_writes_a_table_and_a_figure(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     output = tmp_path / 'corridor'
     assert code_of(experiment.main, 'corridor', '--seeds', 1, '-o', output) == 0
     out = capsys.readouterr().out
@@ -57,7 +59,7 @@ def test_corridor(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert {path.name for path in output.iterdir()} == {'figure.png', 'table.txt'}
 
 
-def test_passer_by(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_passer_by_writes_a_table_and_a_figure(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     output = tmp_path / 'passer'
     assert code_of(experiment.main, 'passer-by', '--seeds', 1, '-o', output) == 0
     out = capsys.readouterr().out
@@ -68,7 +70,7 @@ def test_passer_by(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert (output / 'figure.png').read_bytes().startswith(b'\x89PNG')
 
 
-def test_density(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_density_has_the_peaks_and_weights_of_the_model(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     output = tmp_path / 'density'
     assert code_of(experiment.main, 'density', '--params', PAPER_FILE, '-o', output) == 0
     out = capsys.readouterr().out
@@ -77,7 +79,7 @@ def test_density(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert [float(at) for _, at, _, _ in peaks] == pytest.approx([near, far, 4.0], abs=0.011)
     shares = [0.95 * 0.9, 0.95 * 0.09, 0.95 * 0.01]
     assert [float(share) for *_, share in peaks] == pytest.approx(shares, abs=6e-4)
-    # a normal of 5 cm, and the floor
+    # a normal density of 5 cm, and the floor
     tops = [0.05 / 4 + share / (0.05 * math.sqrt(2 * math.pi)) for share in shares]
     assert [float(top) for _, _, top, _ in peaks] == pytest.approx(tops, rel=0.02)
     assert re.search(r'^chance, everywhere +0\.01[23] +0\.050$', out, re.MULTILINE)
@@ -85,7 +87,7 @@ def test_density(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
 
 
 @pytest.mark.parametrize('p_lost', [0.0, 0.5])
-def test_the_weights_of_the_causes_are_all_there(p_lost: float) -> None:
+def test_weights_of_the_causes_sum_up_to_one(p_lost: float) -> None:
     parameters = Parameters.from_flat({'p_lost': p_lost})
     curve, _ = experiment_density.density_of_ranges(parameters)
     table = experiment_density.density_table(curve, parameters)
@@ -94,7 +96,7 @@ def test_the_weights_of_the_causes_are_all_there(p_lost: float) -> None:
     assert ('echo lost' in table) == (p_lost > 0)
 
 
-def test_the_obstacle_beside_the_cone_changes_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_obstacle_outside_the_cone_changes_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
     parameters = Parameters.from_flat(experiment_maps.PAPER)
     with_it, _ = experiment_density.density_of_ranges(parameters)
     monkeypatch.setattr(experiment_density, 'BESIDE', experiment_density.NEAR)
@@ -107,7 +109,7 @@ def test_the_obstacle_beside_the_cone_changes_nothing(monkeypatch: pytest.Monkey
 
 
 @pytest.mark.slow
-def test_parameters_count(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_parameters_change_only_the_row_of_our_map(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     tables = []
     for name, options in (('a', ()), ('b', ('--set', 'p_hit=0.3', '--set', 'sigma=0.3'))):
         assert code_of(experiment.main, 'door', '--seeds', 1, '-o', tmp_path / name, *options) == 0
@@ -118,7 +120,7 @@ def test_parameters_count(tmp_path: Path, capsys: pytest.CaptureFixture[str]) ->
     assert paper[0] == paper[1]
 
 
-def test_as_in_the_paper_is_what_the_parameter_file_says() -> None:
+def test_constants_of_the_paper_equal_its_parameter_file() -> None:
     values = load_parameters(PAPER_FILE).values
     given = {name: value for name, value in values.items() if name != 'alpha'}
     assert {name: pytest.approx(value, abs=1e-4) for name, value in experiment_maps.PAPER.items()} == given
@@ -132,7 +134,7 @@ def test_as_in_the_paper_is_what_the_parameter_file_says() -> None:
         (('window',), 2, 'door'),
     ],
 )
-def test_wrong_options(
+def test_wrong_experiment_option_is_rejected(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], options: tuple[object, ...], code: int, expected: str
 ) -> None:
     assert code_of(experiment.main, *options, '-o', tmp_path / 'out') == code
@@ -141,7 +143,9 @@ def test_wrong_options(
     assert everything_in(tmp_path) == []
 
 
-def test_demo(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+def test_offline_demo_writes_maps_and_scores(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
     monkeypatch.chdir(tmp_path)
     assert code_of(demo.main, '--seen', 1, '--offline') == 0
     folder = tmp_path / 'demo_output'
@@ -162,7 +166,7 @@ def test_demo(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.Ca
 
 
 @pytest.mark.slow
-def test_demo_through_the_node(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_demo_with_the_node_writes_maps_and_scores(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     pytest.importorskip('rclpy', reason='the demo replays to the node over DDS')
     assert code_of(demo.main, '--seen', 1, '--rate', 20, '-o', tmp_path / 'out') == 0
     out = capsys.readouterr().out
@@ -172,7 +176,7 @@ def test_demo_through_the_node(tmp_path: Path, capsys: pytest.CaptureFixture[str
     assert (tmp_path / 'out' / 'maps' / 'report.txt').is_file()
 
 
-def test_experiments_take_no_bags(tmp_path: Path) -> None:
+def test_experiments_do_not_need_rosbags(tmp_path: Path) -> None:
     code = (
         'import sys; sys.modules["rosbags"] = None; from forward_grid_mapper.commands.experiment import main; '
         'sys.exit(main(sys.argv[1:]))'
@@ -180,7 +184,7 @@ def test_experiments_take_no_bags(tmp_path: Path) -> None:
     subprocess.run([sys.executable, '-c', code, 'density', '-o', str(tmp_path / 'out')], check=True)
 
 
-def test_demo_with_wrong_options(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_wrong_demo_option_is_rejected(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     for options in (
         ('--seen', 0),
         ('--seed', -1),

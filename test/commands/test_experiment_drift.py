@@ -1,4 +1,4 @@
-"""`experiment drift`: its figures by brute force, and the command on a short drive."""
+"""`experiment drift`: its scores, compared with brute force, and the command on a short drive."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from forward_grid_mapper.simulation.sonar import NOISY, sonar_ring
 from forward_grid_mapper.simulation.world import building_tour, building_world, door_world
 
 
-def test_navigable_cells_are_those_with_room_around_them() -> None:
+def test_navigable_cells_have_free_space_around_them() -> None:
     free = np.random.default_rng(0).random((25, 31)) > 0.03
     found = navigable(free, 0.1)
     for row, column in np.ndindex(free.shape):
@@ -33,7 +33,7 @@ def test_navigable_cells_are_those_with_room_around_them() -> None:
     assert 0 < found.sum() < free.sum()
 
 
-def test_a_map_is_brought_to_the_cells_of_the_world() -> None:
+def test_map_is_transferred_to_the_cells_of_the_world() -> None:
     world = door_world()
     assert np.array_equal(on_world(world.reference, world.grid, world), world.reference)
     part = Grid(world.grid.resolution, world.grid.column + 5, world.grid.row + 3, 4, 2)
@@ -43,7 +43,7 @@ def test_a_map_is_brought_to_the_cells_of_the_world() -> None:
     assert np.count_nonzero(there >= 0) == 8
 
 
-def test_alignment_takes_a_rigid_motion_back() -> None:
+def test_alignment_reverses_a_rigid_motion() -> None:
     rng = np.random.default_rng(1)
     true = np.cumsum(rng.normal(0, 1, (40, 3)), 0)
     moved = compose(np.array([3.0, -2.0, 0.7]), true)
@@ -52,7 +52,9 @@ def test_alignment_takes_a_rigid_motion_back() -> None:
 
 
 @pytest.mark.slow
-def test_the_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+def test_experiment_drift_compares_true_odometry_and_refined(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
     tour = building_tour()[:10]
     short = {'building': lambda seed: drive(building_world(), tour, 0.15, sonar_ring(16), NOISY, seed)}
     monkeypatch.setattr(experiment_drift, 'WORLDS', short)

@@ -1,4 +1,4 @@
-"""`explain`: a saved map says why a cell is what it is, and what is wrong with a question."""
+"""`explain`: the evidence of a cell in a saved map, and errors of the arguments."""
 
 from __future__ import annotations
 
@@ -33,14 +33,14 @@ def maps(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def place(archive: MapArchive, state: int) -> tuple[float, float]:
-    """The centre of some cell of this state."""
+    """The centre of a cell in this state."""
     rows, columns = np.nonzero(archive.ml == state)
     x, y = archive.grid.centers()
     k = len(rows) // 2
     return round(float(x[columns[k]]), 3), round(float(y[rows[k]]), 3)
 
 
-def test_the_file_means_its_folder(maps: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_path_of_the_file_equals_that_of_its_folder(maps: Path, capsys: pytest.CaptureFixture[str]) -> None:
     words = []
     for given in (maps, maps / 'maps.npz'):
         assert code_of(explain.main, given, *place(read_npz(maps / 'maps.npz'), 1)) == 0
@@ -49,43 +49,45 @@ def test_the_file_means_its_folder(maps: Path, capsys: pytest.CaptureFixture[str
 
 
 @pytest.mark.parametrize(('state', 'word'), [(1, 'occupied'), (0, 'free'), (-1, 'not observed')])
-def test_a_cell_is_explained(maps: Path, state: int, word: str, capsys: pytest.CaptureFixture[str]) -> None:
+def test_explanation_has_the_nats_of_all_readings(
+    maps: Path, state: int, word: str, capsys: pytest.CaptureFixture[str]
+) -> None:
     archive = read_npz(maps / 'maps.npz')
     x, y = place(archive, state)
     assert code_of(explain.main, maps, x, y) == 0
-    said = capsys.readouterr().out
-    assert said.splitlines()[0].endswith(f': {word}')
+    output = capsys.readouterr().out
+    assert output.splitlines()[0].endswith(f': {word}')
     readings, normals = read_readings(maps / 'readings.npz', archive)
     found = cell_evidence(readings, archive.grid, archive.ml, archive.parameters, normals, (x, y))
-    total = re.search(r'([+-][\d.]+) nats from (\d+) readings?,', said)
+    total = re.search(r'([+-][\d.]+) nats from (\d+) readings?,', output)
     assert total and (float(total[1]), int(total[2])) == (pytest.approx(found.data, abs=0.051), len(found.readings))
-    groups = re.findall(r'^ +([+-][\d.]+)  (\d+) readings? \w+', said, re.MULTILINE)
+    groups = re.findall(r'^ +([+-][\d.]+)  (\d+) readings? \w+', output, re.MULTILINE)
     assert sum(int(count) for _, count in groups) == len(found.readings)
-    assert len(re.findall(r' s  \S+$', said, re.MULTILINE)) == min(explain.SHOWN, len(found.readings))
+    assert len(re.findall(r' s  \S+$', output, re.MULTILINE)) == min(explain.SHOWN, len(found.readings))
 
 
-def test_a_cell_behind_a_wall_says_so(maps: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_explanation_mentions_a_wall_in_between(maps: Path, capsys: pytest.CaptureFixture[str]) -> None:
     archive = read_npz(maps / 'maps.npz')
     readings, normals = read_readings(maps / 'readings.npz', archive)
     x, y = archive.grid.centers()
-    said: dict[str, str] = {}
+    output: dict[str, str] = {}
     for row, column in np.argwhere(archive.ml == -1):
         place = float(x[column]), float(y[row])
         found = cell_evidence(readings, archive.grid, archive.ml, archive.parameters, normals, place)
         if not len(found.readings):
             continue
         part = 'all' if found.through_wall.all() else 'some' if found.through_wall.any() else 'none'
-        if part not in said:
+        if part not in output:
             assert code_of(explain.main, maps, *place, '-n', 0) == 0
-            said[part] = capsys.readouterr().out
-        if len(said) == 3:
+            output[part] = capsys.readouterr().out
+        if len(output) == 3:
             break
-    assert 'a wall blocks all of these' in said['all'] and 'not enough evidence' not in said['all']
-    assert re.search(r'not enough evidence.*; a wall blocks \d+ of these', said['some'])
-    assert 'not enough evidence' in said['none'] and 'a wall blocks' not in said['none']
+    assert 'a wall blocks all of these' in output['all'] and 'not enough evidence' not in output['all']
+    assert re.search(r'not enough evidence.*; a wall blocks \d+ of these', output['some'])
+    assert 'not enough evidence' in output['none'] and 'a wall blocks' not in output['none']
 
 
-def test_readings_are_kept_as_they_were(maps: Path) -> None:
+def test_readings_and_normals_are_saved_with_the_maps(maps: Path) -> None:
     archive = read_npz(maps / 'maps.npz')
     readings, normals = read_readings(maps / 'readings.npz', archive)
     assert len(readings) > 0
@@ -96,46 +98,48 @@ def test_readings_are_kept_as_they_were(maps: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ('words', 'said'),
+    ('words', 'message'),
     [
         (['1000', '0'], 'is not on the map, which spans'),
         (['nan', '0'], 'is not on the map'),
         (['here', '0'], 'invalid float'),
     ],
 )
-def test_a_place_that_is_none_is_named(
-    maps: Path, words: list[str], said: str, capsys: pytest.CaptureFixture[str]
+def test_bad_position_is_rejected_with_reason(
+    maps: Path, words: list[str], message: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert code_of(explain.main, maps, *words) != 0
-    assert said in capsys.readouterr().err
+    assert message in capsys.readouterr().err
 
 
 @pytest.mark.parametrize('place', [('-0.4', '-0.2'), ('-4e-1', '-2E-1'), ('-.4', '-.2'), ('-inf', '-1e+2')])
-def test_a_negative_place_is_no_option(maps: Path, place: tuple[str, str], capsys: pytest.CaptureFixture[str]) -> None:
+def test_negative_position_is_not_parsed_as_an_option(
+    maps: Path, place: tuple[str, str], capsys: pytest.CaptureFixture[str]
+) -> None:
     code_of(explain.main, maps, *place, '-n', 2)
-    said = capsys.readouterr().err
-    assert said == '' or f'({float(place[0]):g}, {float(place[1]):g}) is not on the map' in said
+    error = capsys.readouterr().err
+    assert error == '' or f'({float(place[0]):g}, {float(place[1]):g}) is not on the map' in error
 
 
 @pytest.mark.parametrize('state', [1, 0, -1])
-def test_json_says_the_same(maps: Path, state: int, capsys: pytest.CaptureFixture[str]) -> None:
+def test_json_has_the_same_values(maps: Path, state: int, capsys: pytest.CaptureFixture[str]) -> None:
     archive = read_npz(maps / 'maps.npz')
     x, y = place(archive, state)
     assert code_of(explain.main, maps, x, y, '--json') == 0
-    said = json.loads(capsys.readouterr().out)
+    output = json.loads(capsys.readouterr().out)
     readings, normals = read_readings(maps / 'readings.npz', archive)
     found = cell_evidence(readings, archive.grid, archive.ml, archive.parameters, normals, (x, y))
-    assert (said['row'], said['column'], said['state']) == (found.row, found.column, explain.STATES[state])
-    assert said['nats_of_readings'] == pytest.approx(found.data)
-    assert [row['nats'] for row in said['readings']] == pytest.approx(found.nats.tolist())
-    assert [row['stamp'] for row in said['readings']] == readings.stamp[found.readings].tolist()
-    assert said['number_of_readings'] == len(found.readings)
+    assert (output['row'], output['column'], output['state']) == (found.row, found.column, explain.STATES[state])
+    assert output['nats_of_readings'] == pytest.approx(found.data)
+    assert [row['nats'] for row in output['readings']] == pytest.approx(found.nats.tolist())
+    assert [row['stamp'] for row in output['readings']] == readings.stamp[found.readings].tolist()
+    assert output['number_of_readings'] == len(found.readings)
     assert code_of(explain.main, maps, x, y, '--json', '-n', 1) == 0
     fewer = json.loads(capsys.readouterr().out)
-    assert fewer == {**said, 'readings': said['readings'][:1]}
+    assert fewer == {**output, 'readings': output['readings'][:1]}
 
 
-def test_folders_without_maps_or_readings_are_named(
+def test_folder_without_maps_or_readings_is_rejected(
     maps: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert code_of(explain.main, tmp_path, 0, 0) == 1
@@ -144,8 +148,8 @@ def test_folders_without_maps_or_readings_are_named(
     assert 'give a folder that process_bag or save_maps wrote' in capsys.readouterr().err
     (tmp_path / 'maps.npz').write_bytes((maps / 'maps.npz').read_bytes())
     assert code_of(explain.main, tmp_path, 0, 0) == 1
-    said = capsys.readouterr().err
-    assert 'readings.npz does not exist' in said and 'without --workers' in said
+    error = capsys.readouterr().err
+    assert 'readings.npz does not exist' in error and 'without --workers' in error
     for content, reason in ((b'PK\3\4nothing', 'is damaged'), (None, 'does not belong to the maps next to it')):
         if content is None:
             with np.load(maps / 'readings.npz', allow_pickle=False) as data:
@@ -157,7 +161,7 @@ def test_folders_without_maps_or_readings_are_named(
 
 
 @pytest.mark.parametrize('resolution', [0.05, 0.1, 0.2])
-def test_the_edges_of_a_map_are_those_of_its_cells(resolution: float) -> None:
+def test_position_on_the_edge_of_the_map(resolution: float) -> None:
     nothing = np.zeros((3, 27))
     for column in range(-40, 40):
         grid = Grid(resolution, column, 0, 27, 3)
@@ -171,7 +175,9 @@ def test_the_edges_of_a_map_are_those_of_its_cells(resolution: float) -> None:
 
 
 @pytest.mark.parametrize('name', ['maps.npz', 'readings.npz'])
-def test_a_pipe_is_not_waited_for(maps: Path, tmp_path: Path, name: str, capsys: pytest.CaptureFixture[str]) -> None:
+def test_pipe_in_place_of_a_file_is_rejected_at_once(
+    maps: Path, tmp_path: Path, name: str, capsys: pytest.CaptureFixture[str]
+) -> None:
     (tmp_path / 'maps.npz').write_bytes((maps / 'maps.npz').read_bytes())
     (tmp_path / name).unlink(missing_ok=True)
     os.mkfifo(tmp_path / name)
@@ -188,12 +194,14 @@ def test_a_pipe_is_not_waited_for(maps: Path, tmp_path: Path, name: str, capsys:
         (('3,5', '0,4', '-n', '-3'), '3.5'),
     ],
 )
-def test_a_decimal_comma_is_named(maps: Path, words: Any, right: str, capsys: pytest.CaptureFixture[str]) -> None:
+def test_decimal_comma_is_rejected_with_a_remedy(
+    maps: Path, words: Any, right: str, capsys: pytest.CaptureFixture[str]
+) -> None:
     assert code_of(explain.main, maps, *words) == 2
     assert f'write numbers with a point: {right}\n' in capsys.readouterr().err
 
 
-def test_a_place_may_have_a_comma(maps: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_position_with_a_comma_is_accepted(maps: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert code_of(explain.main, maps, 3.0, 4.0) == 0
     apart = capsys.readouterr().out
     assert code_of(explain.main, maps, '3.0,4.0') == 0

@@ -1,4 +1,4 @@
-"""Poses from a file in place of a bag's odometry: they give what odometry gives, and what is wrong is said."""
+"""Poses from a file in place of odometry give the same readings, and errors are reported."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from drive_samples import Tape, code_of, refusal, report_in, tape, write_tape
+from drive_samples import Tape, code_of, error_of, report_in, tape, write_tape
 
 from forward_grid_mapper.commands import learn, process_bag
 from forward_grid_mapper.core.common.errors import InputError
@@ -24,12 +24,12 @@ KINDS = ('tum', 'csv', 'ns')
 
 @pytest.fixture(autouse=True)
 def no_picture(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Drawing takes most of the time of a run, and no part in these tests."""
+    """Do not draw: it takes most of the time of a run and is not needed here."""
     monkeypatch.setattr(drawing, 'draw', lambda path, picture: None)
 
 
 def written(path: Path, kind: str, drive: Tape | None = None, later: float = 0.0) -> Path:
-    """The odometry of the drive as a file of poses, the last one first."""
+    """Write the odometry of the drive as a file of poses, in reverse order."""
     lines = {'tum': ['# stamp x y z qx qy qz qw'], 'csv': ['stamp,x,y,yaw_deg'], 'ns': ['stamp_ns;x;y;theta']}[kind]
     for m in reversed((drive or tape()).odometry):
         assert m.pose is not None
@@ -52,7 +52,7 @@ def read(bag: Path, poses: Path | None = None) -> Readings:
 
 
 @pytest.mark.parametrize('kind', KINDS)
-def test_a_file_gives_what_odometry_gives(tmp_path: Path, kind: str) -> None:
+def test_poses_from_a_file_give_the_readings_of_odometry(tmp_path: Path, kind: str) -> None:
     with_odometry = write_tape(tmp_path / 'bag', tape())
     without = write_tape(tmp_path / 'without', tape()._replace(odometry=[]))
     file = written(tmp_path / 'poses', kind)
@@ -66,7 +66,7 @@ def test_a_file_gives_what_odometry_gives(tmp_path: Path, kind: str) -> None:
         np.testing.assert_allclose(turn, 0.0, atol=1e-4)
 
 
-def test_the_bags_odometry_has_no_say(tmp_path: Path) -> None:
+def test_odometry_of_the_bag_is_ignored(tmp_path: Path) -> None:
     moved = tape()._replace(
         odometry=[m._replace(pose=m.pose._replace(x=m.pose.x + 5)) for m in tape().odometry if m.pose]
     )
@@ -74,7 +74,7 @@ def test_the_bags_odometry_has_no_say(tmp_path: Path) -> None:
     np.testing.assert_allclose(found.x, read(write_tape(tmp_path / 'true', tape())).x, atol=1e-5)
 
 
-def test_the_frame_of_the_robot_is_that_of_its_odometry(tmp_path: Path) -> None:
+def test_base_frame_with_poses_from_a_file(tmp_path: Path) -> None:
     for name, odometry in (('with', tape().odometry), ('without', [])):
         bag = write_tape(tmp_path / name, tape()._replace(odometry=list(odometry)))
         drives = read_drives([bag], Parameters(), {}, poses=read_given_poses(written(tmp_path / 'poses', 'tum')))
@@ -83,7 +83,7 @@ def test_the_frame_of_the_robot_is_that_of_its_odometry(tmp_path: Path) -> None:
         assert drives.source['odom_topic'] == str(tmp_path / 'poses')
 
 
-def test_a_part_and_several_drives(tmp_path: Path) -> None:
+def test_one_file_of_poses_for_parts_of_several_drives(tmp_path: Path) -> None:
     day = 86_400.0
     later = tape()._replace(
         odometry=[],
@@ -102,7 +102,7 @@ def test_a_part_and_several_drives(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ('text', 'said'),
+    ('text', 'expected'),
     [
         ('', 'has no pose'),
         ('stamp,x,y,yaw\n', 'has no pose'),
@@ -112,17 +112,17 @@ def test_a_part_and_several_drives(tmp_path: Path) -> None:
         ('stamp,x,y,yaw\n5,2,3,0\n6,2,3,0\n', 'the stamps do not overlap: Range has'),
     ],
 )
-def test_what_is_wrong_with_a_file_is_said(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], text: str, said: str
+def test_bad_pose_file_is_rejected_with_reason(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], text: str, expected: str
 ) -> None:
     file = tmp_path / 'poses.txt'
     file.write_text(text)
     bag = write_tape(tmp_path / 'bag', tape())
-    answer = refusal(capsys, tmp_path, bag, '--poses', file, '-o', tmp_path / 'maps')
-    assert said in answer and 'poses.txt' in answer
+    error = error_of(capsys, tmp_path, bag, '--poses', file, '-o', tmp_path / 'maps')
+    assert expected in error and 'poses.txt' in error
 
 
-def test_a_file_without_permission_is_said(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_pose_file_without_permission_is_rejected(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     file = written(tmp_path / 'poses', 'csv')
 
     def refuse(path: Path, *unused: object, **options: object) -> None:
@@ -133,16 +133,16 @@ def test_a_file_without_permission_is_said(tmp_path: Path, monkeypatch: pytest.M
         read_given_poses(file)
 
 
-def test_what_is_no_file_is_said(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_path_that_is_no_pose_file_is_rejected(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     bag = write_tape(tmp_path / 'bag', tape())
     options = (bag, '-o', tmp_path / 'maps', '--poses')
-    assert 'absent does not exist' in refusal(capsys, tmp_path, *options, tmp_path / 'absent')
-    assert 'is not a file with poses' in refusal(capsys, tmp_path, *options, tmp_path)
+    assert 'absent does not exist' in error_of(capsys, tmp_path, *options, tmp_path / 'absent')
+    assert 'is not a file with poses' in error_of(capsys, tmp_path, *options, tmp_path)
     file = written(tmp_path / 'poses', 'csv')
-    assert 'leave out --odom-topic' in refusal(capsys, tmp_path, *options, file, '--odom-topic', '/odom')
+    assert 'leave out --odom-topic' in error_of(capsys, tmp_path, *options, file, '--odom-topic', '/odom')
 
 
-def test_learn_names_the_poses_in_what_it_prints(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_command_printed_by_learn_names_the_poses(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     bag = write_tape(tmp_path / 'bag', tape()._replace(odometry=[]))
     file, output = written(tmp_path / 'poses', 'csv'), tmp_path / 'learned.yaml'
     assert code_of(learn.main, bag, '--poses', file, '-o', output, '--rounds', 1, '--keep-going') == 0

@@ -1,4 +1,4 @@
-"""The command `learn`: what it prints, the file it writes, and that process_bag takes it."""
+"""The command `learn`: its output, the file it writes, and process_bag with this file."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 import yaml
-from drive_samples import backwards, code_of, everything_in, mapped, tape, write_tape
+from drive_samples import backwards_sensors, code_of, everything_in, mapped, tape, write_tape
 
 from forward_grid_mapper.commands import learn
 from forward_grid_mapper.core.common.parameters import Parameters
@@ -24,11 +24,11 @@ LEARNED = ('p_hit', 'p_rand', 'p_lost', 'sigma')
 
 @pytest.fixture(scope='module')
 def bag(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A sound bag of the drive."""
+    """A correct bag of the drive."""
     return write_tape(tmp_path_factory.mktemp('plain') / 'bag', tape())
 
 
-def said(capsys: pytest.CaptureFixture[str], *arguments: object, code: int = 0) -> str:
+def output_of(capsys: pytest.CaptureFixture[str], *arguments: object, code: int = 0) -> str:
     capsys.readouterr()
     assert code_of(learn.main, *arguments) == code
     out, err = capsys.readouterr()
@@ -36,8 +36,8 @@ def said(capsys: pytest.CaptureFixture[str], *arguments: object, code: int = 0) 
     return out if code == 0 else err
 
 
-def test_values_errors_and_rounds_are_told(bag: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    text = said(capsys, bag, '--rounds', 2, '--keep-going')
+def test_output_has_values_errors_and_rounds(bag: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    text = output_of(capsys, bag, '--rounds', 2, '--keep-going')
     start = Parameters().model
     for name in LEARNED:
         (row,) = re.findall(rf'^  {name} +([\d.]+) +([\d.]+) .*readings$', text, re.MULTILINE)
@@ -48,11 +48,9 @@ def test_values_errors_and_rounds_are_told(bag: Path, capsys: pytest.CaptureFixt
     assert all(len(line) <= 110 for line in text.splitlines())
 
 
-def test_json_has_the_values_and_nothing_else_is_printed(
-    tmp_path: Path, bag: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_json_prints_only_the_values(tmp_path: Path, bag: Path, capsys: pytest.CaptureFixture[str]) -> None:
     file = tmp_path / 'learned.yaml'
-    found = json.loads(said(capsys, bag, '--rounds', 2, '--json', '--keep-going', '-o', file))
+    found = json.loads(output_of(capsys, bag, '--rounds', 2, '--json', '--keep-going', '-o', file))
     assert found['file'] == str(file)
     values = load_parameters(file).values
     for name in LEARNED:
@@ -61,7 +59,7 @@ def test_json_has_the_values_and_nothing_else_is_printed(
     assert len(found['rounds']) > found['accepted_round'] >= 0
 
 
-def test_the_file_is_what_process_bag_takes(
+def test_learned_file_is_accepted_by_process_bag(
     tmp_path: Path, bag: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(drawing, 'draw', lambda path, picture: path.write_bytes(b''))
@@ -83,7 +81,7 @@ def test_the_file_is_what_process_bag_takes(
     )
     output = tmp_path / 'learned.yaml'
     options = ('--rounds', 1, '--keep-going', '--params', given, '--set', 'p_rand=0.3', '--sensor', 'other=1,2,90deg')
-    text = said(capsys, bag, '-o', output, *options)
+    text = output_of(capsys, bag, '-o', output, *options)
     assert str(output) in text
     values, extrinsics, node = load_parameters(output)
     assert node == {'use_sim_time': True}
@@ -96,11 +94,11 @@ def test_the_file_is_what_process_bag_takes(
     assert {name: report['parameters'][name] for name in LEARNED} == {name: values[name] for name in LEARNED}
 
 
-def test_values_that_held_out_readings_speak_against_are_not_handed_out(
+def test_values_rejected_by_held_out_readings_are_not_written(
     tmp_path: Path, bag: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     file = tmp_path / 'learned.yaml'
-    found = json.loads(said(capsys, bag, '--rounds', 2, '--json', '-o', file))
+    found = json.loads(output_of(capsys, bag, '--rounds', 2, '--json', '-o', file))
     seen = found['cross_validation']
     better = all(
         seen[f'learned_at_{values}'] - seen[f'first_at_{values}'] > seen[f'error_at_{values}']
@@ -114,22 +112,20 @@ def test_values_that_held_out_readings_speak_against_are_not_handed_out(
     assert 'Nothing was learned from' in file.read_text().splitlines()[0]
 
 
-def test_what_was_not_judged_is_told(bag: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    told = 'no readings were held out to test the learned values'
-    assert told in ' '.join(said(capsys, bag, '--rounds', 1, '--keep-going').split())
-    assert told not in ' '.join(said(capsys, bag, '--rounds', 1).split())
+def test_output_mentions_that_values_were_not_tested(bag: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    text = 'no readings were held out to test the learned values'
+    assert text in ' '.join(output_of(capsys, bag, '--rounds', 1, '--keep-going').split())
+    assert text not in ' '.join(output_of(capsys, bag, '--rounds', 1).split())
 
 
 def test_sensors_with_long_names_are_read_back(tmp_path: Path, bag: Path, capsys: pytest.CaptureFixture[str]) -> None:
     frame, file = 'f' * 200, tmp_path / 'learned.yaml'
-    said(capsys, bag, '--rounds', 1, '--sensor', f'{frame}=1,2,90deg', '-o', file)
+    output_of(capsys, bag, '--rounds', 1, '--sensor', f'{frame}=1,2,90deg', '-o', file)
     assert load_parameters(file).extrinsics[frame] == pytest.approx((1.0, 2.0, math.pi / 2))
     assert list(yaml.safe_load(file.read_text())) == ['/**']
 
 
-def test_nothing_is_left_of_a_file_whose_writing_is_interrupted(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_interrupted_writing_leaves_no_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     class Interrupted(io.StringIO):
         def write(self, text: str) -> int:
             raise KeyboardInterrupt
@@ -144,54 +140,54 @@ def test_nothing_is_left_of_a_file_whose_writing_is_interrupted(
     assert not list(tmp_path.iterdir())
 
 
-def test_files_are_never_overwritten(tmp_path: Path, bag: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_existing_file_is_not_overwritten(tmp_path: Path, bag: Path, capsys: pytest.CaptureFixture[str]) -> None:
     taken = tmp_path / 'mine.yaml'
     taken.write_text('mine')
     before = everything_in(tmp_path)
     for path, expected in ((taken, 'exists'), (tmp_path, 'exists'), (tmp_path / 'none' / 'x.yaml', 'not a folder')):
-        message = said(capsys, bag, '-o', path, code=1)
+        message = output_of(capsys, bag, '-o', path, code=1)
         assert message.startswith('learn: error: ') and expected in message and '--output' in message
     assert everything_in(tmp_path) == before and taken.read_text() == 'mine'
 
 
-def test_a_place_without_permission_is_told_of_before_the_work(
+def test_output_without_permission_is_reported_before_the_work(
     tmp_path: Path, bag: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setattr(os, 'access', lambda path, mode: mode == os.F_OK)
     monkeypatch.setattr(learn, 'read_drives', lambda *arguments: pytest.fail('it began to work'))
-    message = said(capsys, bag, '-o', tmp_path / 'x.yaml', code=1)
+    message = output_of(capsys, bag, '-o', tmp_path / 'x.yaml', code=1)
     assert message.endswith(f'{tmp_path} is not writable; choose another folder with --output\n')
 
 
-def test_a_bad_request(bag: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert '--rounds' in said(capsys, bag, '--rounds', 0, code=1)
-    assert 'p_hit' in said(capsys, bag, '--set', 'p_hit=2', code=1)
-    assert 'absent' in said(capsys, tmp_path / 'absent', code=1)
+def test_bad_arguments_are_rejected(bag: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert '--rounds' in output_of(capsys, bag, '--rounds', 0, code=1)
+    assert 'p_hit' in output_of(capsys, bag, '--set', 'p_hit=2', code=1)
+    assert 'absent' in output_of(capsys, tmp_path / 'absent', code=1)
 
 
-def test_quiet(bag: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_quiet_prints_only_warnings(bag: Path, capsys: pytest.CaptureFixture[str]) -> None:
     capsys.readouterr()
     assert code_of(learn.main, bag, '-q', '--rounds', 1) == 0
     out, err = capsys.readouterr()
     assert out == '' and all(line.startswith('learn: warning: ') for line in err.splitlines()) and err
 
 
-def test_a_sensor_that_stands_out_is_told_of(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """One that hears its own mount: always the same short range."""
+def test_sensor_that_differs_from_others_gives_a_warning(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """A sensor that sees its own mount always has the same short range."""
     broken = tape().extrinsics[3][0]
     ranges = [m._replace(range=0.25) if m.frame_id == broken else m for m in tape().ranges]
     bag = write_tape(tmp_path / 'bag', tape()._replace(ranges=ranges))
     output = tmp_path / 'learned.yaml'
-    text = ' '.join(said(capsys, bag, '--rounds', 1, '-o', output).split())
+    text = ' '.join(output_of(capsys, bag, '--rounds', 1, '-o', output).split())
     assert f'a sensor stands out from the others: {broken} (always short: 0.25 m)' in text
     assert f'# WARNING: a sensor stands out from the others: {broken}' in output.read_text()
     assert code_of(learn.main, bag, '--rounds', 1, '-q') == 0
     assert f'learn: warning: a sensor stands out from the others: {broken}' in capsys.readouterr().err
 
 
-def test_input_that_is_wrong_is_told_of(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    wrong = backwards()[1]
+def test_warnings_about_wrong_input(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    wrong = backwards_sensors()[1]
     bag = write_tape(tmp_path / 'bag', wrong._replace(ranges=[m for m in wrong.ranges for _ in range(2)]))
-    text = ' '.join(said(capsys, bag, '--rounds', 1).split())
+    text = ' '.join(output_of(capsys, bag, '--rounds', 1).split())
     assert 'are copies of others' in text and 'recorded twice' in text
     assert 'the sensors seem to be rotated by 180 degrees; check the poses of the sensors' in text

@@ -1,4 +1,4 @@
-"""Several drives make one map: which are meant, that their order does not matter, and what they contradict."""
+"""One map of several drives: which drives are found, independence of their order, and contradictions between them."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from drive_samples import FILES, Tape, arrays_in, assert_same_maps, code_of, mapped, refusal, report_in, write_tape
+from drive_samples import FILES, Tape, arrays_in, assert_same_maps, code_of, error_of, mapped, report_in, write_tape
 
 from forward_grid_mapper.commands import learn, process_bag
 from forward_grid_mapper.core.common.errors import InputError
@@ -38,12 +38,12 @@ KINDS = ('mcap', 'sqlite3', 'ros1')
 
 @pytest.fixture(autouse=True)
 def quick_picture(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Drawing takes most of the time of a run."""
+    """Do not draw: it takes most of the time of a run."""
     monkeypatch.setattr(drawing, 'draw', lambda path, picture: path.write_bytes(b''))
 
 
 def day(number: int, later: int = DAY) -> Tape:
-    """The drive past the door on a day of its own, with noise of its own."""
+    """The drive past the door on another day, with other noise."""
     made = door_drive(1, NOISY, number, front_array())
     shift = number * later
     return Tape(
@@ -55,7 +55,7 @@ def day(number: int, later: int = DAY) -> Tape:
 
 @pytest.fixture(scope='module')
 def days(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder with a bag of each of three days, each in another format."""
+    """A folder with bags of three days in three formats."""
     folder = tmp_path_factory.mktemp('days')
     for number, kind in enumerate(KINDS):
         name = f'day_{number}.bag' if kind == 'ros1' else f'day_{number}'
@@ -74,7 +74,7 @@ def names(drives: Drives) -> list[str]:
 # ---- which drives
 
 
-def test_a_folder_a_pattern_and_paths_mean_the_same(days: Path, tmp_path: Path) -> None:
+def test_folder_pattern_and_paths_give_the_same_maps(days: Path, tmp_path: Path) -> None:
     paths = [days / 'day_0', days / 'day_1', days / 'day_2.bag']
     one = mapped(days, tmp_path / 'a')
     assert [Path(drive['bag']).name for drive in one['drives']] == ['day_0', 'day_1', 'day_2.bag']
@@ -86,7 +86,7 @@ def test_a_folder_a_pattern_and_paths_mean_the_same(days: Path, tmp_path: Path) 
 
 
 @pytest.mark.parametrize('order', list(itertools.permutations(range(3))))
-def test_the_order_of_arguments_does_not_matter(days: Path, tmp_path: Path, order: tuple[int, ...]) -> None:
+def test_maps_do_not_depend_on_the_order_of_arguments(days: Path, tmp_path: Path, order: tuple[int, ...]) -> None:
     paths = sorted(days.iterdir())
     assert code_of(process_bag.main, *(paths[k] for k in order), '-o', tmp_path / 'maps', '-q') == 0
     report = report_in(tmp_path / 'maps')
@@ -102,7 +102,7 @@ def test_the_order_of_arguments_does_not_matter(days: Path, tmp_path: Path, orde
             np.testing.assert_array_equal(getattr(columns[0], name), getattr(columns[1], name))
 
 
-def test_a_bag_without_static_transforms_uses_those_of_another(days: Path, tmp_path: Path) -> None:
+def test_bag_without_static_transforms_uses_those_of_another(days: Path, tmp_path: Path) -> None:
     without = write_tape(tmp_path / 'without', day(1)._replace(extrinsics=()))
     expected = read(days / 'day_0', days / 'day_1').readings
     for order in ([days / 'day_0', without], [without, days / 'day_0'], [days / 'day_0', without, days / 'day_2.bag']):
@@ -134,7 +134,7 @@ def test_transforms_of_other_bags_that_differ_are_not_used(tmp_path: Path) -> No
     assert frame not in mapped_drive.source['extrinsics'] and len(mapped_drive.source['extrinsics']) == len(moved) - 1
 
 
-def test_transforms_of_a_robot_with_other_frames_are_no_help(days: Path, tmp_path: Path) -> None:
+def test_transforms_of_a_robot_with_other_frames_are_not_used(days: Path, tmp_path: Path) -> None:
     renamed = day(1)
     renamed = renamed._replace(extrinsics=(), ranges=[m._replace(frame_id=f'r2/{m.frame_id}') for m in renamed.ranges])
     without = write_tape(tmp_path / 'without', renamed)
@@ -142,7 +142,7 @@ def test_transforms_of_a_robot_with_other_frames_are_no_help(days: Path, tmp_pat
         read(days / 'day_0', without)
 
 
-def test_drives_at_one_time_have_one_order_too(tmp_path: Path) -> None:
+def test_simultaneous_drives_have_a_defined_order(tmp_path: Path) -> None:
     paths = [write_tape(tmp_path / f'robot_{number}', day(number, 0)) for number in range(3)]
     orders = [names(read(*order)) for order in itertools.permutations(paths)]
     assert all(order == orders[0] for order in orders)
@@ -152,7 +152,7 @@ def test_drives_at_one_time_have_one_order_too(tmp_path: Path) -> None:
     assert maps[0].log_likelihood == maps[1].log_likelihood
 
 
-def test_the_map_is_that_of_all_readings(days: Path, tmp_path: Path) -> None:
+def test_map_of_several_drives_is_that_of_all_readings(days: Path, tmp_path: Path) -> None:
     mapped(days, tmp_path / 'maps')
     parts = [read(path).readings for path in sorted(days.iterdir())]
     whole = Readings.from_columns(
@@ -167,8 +167,8 @@ def test_the_map_is_that_of_all_readings(days: Path, tmp_path: Path) -> None:
     assert maps.log_likelihood == pytest.approx(found.log_likelihood)
 
 
-def test_one_robot_does_not_sweep_the_way_to_another(tmp_path: Path) -> None:
-    """Two robots a door apart, at the same times: no line between them is free."""
+def test_cells_between_two_robots_are_not_traversed(tmp_path: Path) -> None:
+    """Two robots on both sides of a door, at the same times: no line between them is free."""
     still = day(0)._replace(odometry=[m._replace(pose=Pose2(1.0, 1.0, 0.0)) for m in day(0).odometry])
     apart = day(1, 0)._replace(odometry=[m._replace(pose=Pose2(1.0, 1.6, 0.0)) for m in day(1, 0).odometry])
     paths = [write_tape(tmp_path / 'one', still), write_tape(tmp_path / 'other', apart)]
@@ -187,7 +187,7 @@ def test_one_robot_does_not_sweep_the_way_to_another(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize('bound', [100, 700])
-def test_max_readings_bounds_all_drives_together(days: Path, tmp_path: Path, bound: int) -> None:
+def test_max_readings_is_the_sum_over_all_drives(days: Path, tmp_path: Path, bound: int) -> None:
     report = mapped_thinned(days, tmp_path / 'maps', bound)
     assert report['result']['readings'] == bound < report['counts']['accepted']
     (note,) = report['warnings']
@@ -205,7 +205,7 @@ def mapped_thinned(days: Path, folder: Path, bound: int) -> dict[str, Any]:
 # ---- the report
 
 
-def test_the_report_names_each_drive(days: Path, tmp_path: Path) -> None:
+def test_report_has_counts_of_each_drive(days: Path, tmp_path: Path) -> None:
     report = mapped(days, tmp_path / 'maps')
     assert report['counts']['received'] == sum(drive['counts']['received'] for drive in report['drives'])
     for drive in report['drives']:
@@ -220,7 +220,7 @@ def test_the_report_names_each_drive(days: Path, tmp_path: Path) -> None:
         assert drive['bag'] in text and f'{drive["counts"]["accepted"]:,}' in text
 
 
-def test_the_picture_has_a_path_for_each_drive(days: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_picture_has_a_path_for_each_drive(days: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     pictures = []
     monkeypatch.setattr(drawing, 'draw', lambda path, picture: (pictures.append(picture), path.write_bytes(b'')))
     mapped(days, tmp_path / 'maps')
@@ -231,12 +231,12 @@ def test_the_picture_has_a_path_for_each_drive(days: Path, tmp_path: Path, monke
     assert pictures[0].title.endswith('day_0 and 2 more')
 
 
-def test_a_bag_of_the_maps_of_several(days: Path, tmp_path: Path) -> None:
+def test_bag_of_the_maps_of_several_drives(days: Path, tmp_path: Path) -> None:
     mapped(days, tmp_path / 'maps', '--bag')
     assert (tmp_path / 'maps' / 'maps.mcap_bag').is_dir()
 
 
-def test_default_names(days: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_default_output_names(days: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.undo()
     monkeypatch.chdir(tmp_path)
     assert code_of(process_bag.main, days, '-q') == 0
@@ -248,7 +248,7 @@ def test_default_names(days: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPat
 # ---- the same drive twice
 
 
-def test_one_bag_under_several_names_is_read_once(days: Path, tmp_path: Path) -> None:
+def test_bag_under_several_names_is_read_once(days: Path, tmp_path: Path) -> None:
     link = tmp_path / 'link'
     link.symlink_to(days / 'day_0')
     file = next((days / 'day_0').glob('*.mcap'))
@@ -260,7 +260,7 @@ def test_one_bag_under_several_names_is_read_once(days: Path, tmp_path: Path) ->
 
 
 @pytest.mark.parametrize('kind', KINDS)
-def test_a_copy_in_another_format_is_left_out(days: Path, tmp_path: Path, kind: str) -> None:
+def test_copy_in_another_format_is_left_out(days: Path, tmp_path: Path, kind: str) -> None:
     copy = write_tape(tmp_path / ('copy.bag' if kind == 'ros1' else 'copy'), day(0), kind)
     for words in ((days / 'day_0', copy, days / 'day_1'), (copy, days / 'day_1', days / 'day_0')):
         drives = read(*words)
@@ -275,7 +275,7 @@ def test_a_copy_in_another_format_is_left_out(days: Path, tmp_path: Path, kind: 
     assert len(alone.drives) == 1 and 'is the same drive' in alone.source['warnings'][0]
 
 
-def test_copies_are_told_in_one_warning(days: Path, tmp_path: Path) -> None:
+def test_copies_give_one_warning(days: Path, tmp_path: Path) -> None:
     copies = [write_tape(tmp_path / f'copy_{k}', day(0), 'sqlite3') for k in range(3)]
     part = write_tape(tmp_path / 'part', day(0)._replace(ranges=day(0).ranges[:200]))
     drives = read(days / 'day_0', days / 'day_1', *copies)
@@ -286,7 +286,7 @@ def test_copies_are_told_in_one_warning(days: Path, tmp_path: Path) -> None:
     assert len(both) == 2 and f'leave out {part}' in both[1]
 
 
-def test_a_part_of_a_drive_beside_it_is_told(days: Path, tmp_path: Path) -> None:
+def test_part_of_another_drive_gives_a_warning(days: Path, tmp_path: Path) -> None:
     whole = day(0)
     half = whole._replace(ranges=whole.ranges[: len(whole.ranges) // 2])
     part = write_tape(tmp_path / 'half', half)
@@ -296,7 +296,7 @@ def test_a_part_of_a_drive_beside_it_is_told(days: Path, tmp_path: Path) -> None
     assert warnings[0].startswith(f'{echoes} of {echoes} echoes of {part} are in {days / "day_0"} as well')
 
 
-# ---- what drives contradict each other in
+# ---- contradictions between drives
 
 
 def framed(number: int, frame: str) -> Tape:
@@ -304,18 +304,20 @@ def framed(number: int, frame: str) -> Tape:
     return drive._replace(odometry=[m._replace(frame_id=frame) for m in drive.odometry])
 
 
-def test_drives_of_different_frames_are_refused(days: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_drives_in_different_map_frames_are_rejected(
+    days: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     other = write_tape(tmp_path / 'other', framed(2, 'warehouse'))
-    said = refusal(capsys, tmp_path, days / 'day_0', days / 'day_1', other, '-o', tmp_path / 'maps')
-    assert 'not in the same map frame' in said and f'warehouse: {other}' in said and f'leave out {other}' in said
+    error = error_of(capsys, tmp_path, days / 'day_0', days / 'day_1', other, '-o', tmp_path / 'maps')
+    assert 'not in the same map frame' in error and f'warehouse: {other}' in error and f'leave out {other}' in error
 
 
-def test_a_leading_slash_is_no_other_frame(days: Path, tmp_path: Path) -> None:
+def test_leading_slash_is_no_different_frame(days: Path, tmp_path: Path) -> None:
     other = write_tape(tmp_path / 'other.bag', framed(2, '/odom'), 'ros1')
     assert len(read(days / 'day_0', other).drives) == 2
 
 
-def test_a_sensor_that_sits_elsewhere_is_told(days: Path, tmp_path: Path) -> None:
+def test_different_pose_of_a_sensor_gives_a_warning(days: Path, tmp_path: Path) -> None:
     drive = day(2)
     (frame, pose), *rest = drive.extrinsics
     moved = [(frame, pose._replace(x=pose.x + 0.05)), *rest]
@@ -325,7 +327,7 @@ def test_a_sensor_that_sits_elsewhere_is_told(days: Path, tmp_path: Path) -> Non
     assert f'in {other}, and at x = {pose.x:.2f} m' in warning and f'--sensor {frame}=x,y,yaw' in warning
 
 
-def test_robots_of_different_frames_may_differ(days: Path, tmp_path: Path) -> None:
+def test_robots_with_different_base_frames_may_differ(days: Path, tmp_path: Path) -> None:
     drive = day(2)
     (frame, pose), *rest = drive.extrinsics
     moved = [(frame, pose._replace(x=pose.x + 0.05)), *rest]
@@ -336,7 +338,7 @@ def test_robots_of_different_frames_may_differ(days: Path, tmp_path: Path) -> No
     assert not any('is mounted on the robot' in warning for warning in drives.source['warnings'])
 
 
-def test_a_sensor_of_other_limits_is_told(days: Path, tmp_path: Path) -> None:
+def test_different_limits_of_a_sensor_give_a_warning(days: Path, tmp_path: Path) -> None:
     drive = day(2)
     frame = drive.extrinsics[1][0]
     ranges = [m._replace(field_of_view=2 * m.field_of_view) if m.frame_id == frame else m for m in drive.ranges]
@@ -345,7 +347,7 @@ def test_a_sensor_of_other_limits_is_told(days: Path, tmp_path: Path) -> None:
     assert warning.startswith(f'{frame} has a range of') and str(other) in warning and 'field_of_view' in warning
 
 
-def test_a_sensor_that_is_missing_is_told(days: Path, tmp_path: Path) -> None:
+def test_missing_sensor_gives_a_warning(days: Path, tmp_path: Path) -> None:
     drive = day(2)
     frame = drive.extrinsics[3][0]
     other = write_tape(tmp_path / 'other', drive._replace(ranges=[m for m in drive.ranges if m.frame_id != frame]))
@@ -354,7 +356,7 @@ def test_a_sensor_that_is_missing_is_told(days: Path, tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_a_drive_in_a_frame_of_its_own_is_told(tmp_path: Path) -> None:
+def test_drive_that_does_not_fit_the_map_gives_a_warning(tmp_path: Path) -> None:
     way = np.array([[1.5, 1.5], [3.0, 3.45], [9.0, 3.45], [9.0, 2.0], [10.5, 6.5]])
     paths = []
     for number in range(3):
@@ -365,11 +367,11 @@ def test_a_drive_in_a_frame_of_its_own_is_told(tmp_path: Path) -> None:
         ranges = [m._replace(stamp=m.stamp + number * DAY) for m in made.ranges]
         paths.append(write_tape(tmp_path / f'day_{number}', Tape(made.extrinsics, odometry, ranges)))
     assert code_of(process_bag.main, *paths, '-o', tmp_path / 'maps', '-q') == 0
-    (told,) = report_in(tmp_path / 'maps')['warnings']
-    assert told.startswith(f'{paths[2]} (') and 'Localise all drives' in told
+    (warning,) = report_in(tmp_path / 'maps')['warnings']
+    assert warning.startswith(f'{paths[2]} (') and 'Localise all drives' in warning
 
 
-def test_warnings_name_their_drive(days: Path, tmp_path: Path) -> None:
+def test_warning_names_its_drive(days: Path, tmp_path: Path) -> None:
     drive = day(2)
     frame = drive.extrinsics[0][0]
     other = write_tape(tmp_path / 'other', drive._replace(extrinsics=drive.extrinsics[1:]))
@@ -380,17 +382,17 @@ def test_warnings_name_their_drive(days: Path, tmp_path: Path) -> None:
 # ---- errors
 
 
-def test_every_drive_that_cannot_be_mapped_is_named(
+def test_all_drives_that_cannot_be_mapped_are_named(
     days: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     absent = tmp_path / 'absent'
     silent = write_tape(tmp_path / 'silent', day(2)._replace(ranges=[]))
-    said = refusal(capsys, tmp_path, days / 'day_0', absent, silent, '-o', tmp_path / 'maps')
-    assert said.startswith('2 of 3 drives cannot be mapped; leave them out')
-    assert f'{absent} does not exist' in said and f'{silent}: The bag has no sensor_msgs/Range' in said
+    error = error_of(capsys, tmp_path, days / 'day_0', absent, silent, '-o', tmp_path / 'maps')
+    assert error.startswith('2 of 3 drives cannot be mapped; leave them out')
+    assert f'{absent} does not exist' in error and f'{silent}: The bag has no sensor_msgs/Range' in error
 
 
-def test_lines_of_one_drive_are_told_from_other_drives() -> None:
+def test_error_lines_of_one_drive_are_indented() -> None:
     errors = [(Path('a'), InputError('choose one:\n  /odom\n  /odom_2')), (Path('b'), InputError('b is empty'))]
     assert str(unreadable(errors, 3)).splitlines()[1:] == [
         '  a: choose one:',
@@ -400,23 +402,23 @@ def test_lines_of_one_drive_are_told_from_other_drives() -> None:
     ]
 
 
-def test_a_pattern_that_fits_nothing(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    said = refusal(capsys, tmp_path, f'{tmp_path}/monday_*', '-o', tmp_path / 'maps')
-    assert f'no file or folder matches {tmp_path}/monday_*' in said
+def test_pattern_without_match_is_rejected(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    error = error_of(capsys, tmp_path, f'{tmp_path}/monday_*', '-o', tmp_path / 'maps')
+    assert f'no file or folder matches {tmp_path}/monday_*' in error
 
 
-def test_files_of_one_bag_without_metadata_are_no_drives(
+def test_files_of_a_split_bag_without_metadata_are_rejected(
     days: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     folder = tmp_path / 'split'
     folder.mkdir()
     for number in range(2):
         shutil.copy(next((days / 'day_0').glob('*.mcap')), folder / f'split_{number}.mcap')
-    said = refusal(capsys, tmp_path, folder, '-o', tmp_path / 'maps')
-    assert 'ros2 bag reindex' in said
+    error = error_of(capsys, tmp_path, folder, '-o', tmp_path / 'maps')
+    assert 'ros2 bag reindex' in error
 
 
-def test_a_bag_without_metadata_in_a_folder_is_a_drive_like_others(days: Path, tmp_path: Path) -> None:
+def test_bag_without_metadata_in_a_folder_is_a_drive(days: Path, tmp_path: Path) -> None:
     for name in ('day_0', 'day_1'):
         shutil.copytree(days / name, tmp_path / 'days' / name)
     (tmp_path / 'days' / 'day_1' / 'metadata.yaml').unlink()
@@ -429,7 +431,7 @@ def test_a_bag_without_metadata_in_a_folder_is_a_drive_like_others(days: Path, t
 # ---- parts
 
 
-def test_parts_of_a_drive_make_up_the_whole(days: Path) -> None:
+def test_parts_of_a_drive_add_up_to_the_whole(days: Path) -> None:
     path = days / 'day_0'
     whole = in_canonical_order(read(path).readings)
     first = int(min(m.stamp for m in (*day(0).ranges, *day(0).odometry)))
@@ -443,7 +445,7 @@ def test_parts_of_a_drive_make_up_the_whole(days: Path) -> None:
         np.testing.assert_array_equal(np.concatenate([getattr(p, name) for p in found]), getattr(whole, name))
 
 
-def test_a_part_of_each_drive(days: Path, tmp_path: Path) -> None:
+def test_part_is_taken_of_each_drive(days: Path, tmp_path: Path) -> None:
     report = mapped(days, tmp_path / 'maps', '--start', 2, '--duration', 3)
     for drive in report['drives']:
         assert 2.0 < drive['duration_s'] <= 3.0
@@ -451,12 +453,14 @@ def test_a_part_of_each_drive(days: Path, tmp_path: Path) -> None:
     assert one['counts']['accepted'] == report['drives'][1]['counts']['accepted'] < len(day(1).ranges)
 
 
-def test_a_part_that_is_not_there(days: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    said = refusal(capsys, tmp_path, days / 'day_0', '-o', tmp_path / 'maps', '--start', 900)
-    assert 'has no reading in the part --start 900; its messages span' in said
+def test_part_after_the_end_of_the_drive_is_rejected(
+    days: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    error = error_of(capsys, tmp_path, days / 'day_0', '-o', tmp_path / 'maps', '--start', 900)
+    assert 'has no reading in the part --start 900; its messages span' in error
 
 
-def test_learn_takes_several_drives(days: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_learn_accepts_several_drives(days: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert code_of(learn.main, days, '-o', tmp_path / 'a.yaml', '--rounds', 1, '--keep-going', '-q') == 0
     paths = sorted(days.iterdir(), reverse=True)
     assert code_of(learn.main, *paths, '-o', tmp_path / 'b.yaml', '--rounds', 1, '--keep-going', '-q') == 0

@@ -1,4 +1,4 @@
-"""Real drives with default parameters, scored against the laser's map."""
+"""Real drives with default parameters, scored with the map of a laser."""
 
 from __future__ import annotations
 
@@ -16,12 +16,12 @@ LEAST = {
     ('office_a', 'live_map'): (0.75, 0.0),
     ('office_b', 'live_map'): (0.66, 0.0),
 }
-"""The fraction of the floor that a robot may use in map and reference alike (nav_iou), and F1 of the wall cells."""
+"""Least share of the navigable floor common to map and reference (nav_iou), and least F1 of the wall cells."""
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize('run', ['office_a', 'office_b'])
-def test_floor_that_a_robot_may_use(shared: Path, tmp_path: Path, run: str) -> None:
+def test_maps_of_offices_reach_the_least_scores(shared: Path, tmp_path: Path, run: str) -> None:
     pytest.importorskip('scipy', reason='score_map.py needs scipy')
     data = shared / 'data' / run
     report = mapped(data / 'bag', tmp_path / 'maps', '--odom-topic', '/odom_corrected')
@@ -36,7 +36,7 @@ def test_floor_that_a_robot_may_use(shared: Path, tmp_path: Path, run: str) -> N
 
 
 @pytest.mark.parametrize(('run', 'count'), [('office_a', 1591), ('office_b', 815)])
-def test_wheel_odometry(shared: Path, tmp_path: Path, run: str, count: int) -> None:
+def test_office_is_mapped_with_wheel_odometry(shared: Path, tmp_path: Path, run: str, count: int) -> None:
     report = mapped(shared / 'data' / run / 'bag', tmp_path / 'maps', '--odom-topic', '/odom')
     assert (report['input']['odom_topic'], report['input']['odom_frame']) == ('/odom', 'odom')
     assert report['counts']['received'] == count

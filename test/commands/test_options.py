@@ -1,4 +1,4 @@
-"""Options that several commands share: topics before and behind the bag, and parameters that only the node has."""
+"""Options that several commands share: topics before and after the bag, and parameters that only the node has."""
 
 from __future__ import annotations
 
@@ -27,25 +27,27 @@ PARSERS = [process_bag.parser, learn.parser, replay_bag.parser]
 
 @pytest.fixture
 def bag(tmp_path: Path) -> str:
-    """Something that exists."""
+    """A path that exists."""
     (tmp_path / 'bag').mkdir()
     return str(tmp_path / 'bag')
 
 
 def bags_of(options: argparse.Namespace) -> list[str]:
-    """The bags that were found, of commands that take one or several."""
+    """The bags found by the parser, for commands with one or several bags."""
     return options.bags if hasattr(options, 'bags') else [options.bag]
 
 
 @pytest.mark.parametrize('command', [process_bag, learn])
-def test_two_poses_of_one_sensor(command: ModuleType, bag: str, capsys: pytest.CaptureFixture[str]) -> None:
+def test_two_poses_of_one_sensor_are_rejected(
+    command: ModuleType, bag: str, capsys: pytest.CaptureFixture[str]
+) -> None:
     assert code_of(command.main, bag, '--sensor', 'a=0,0,1', '--sensor', '/a=0,0,2') == 1
     assert '--sensor gives two poses of /a; give one of them' in capsys.readouterr().err
     options = command.parser().parse_args([bag, '--sensor', 'a=0,0,1', '--sensor', '/a=0,0,1', '--sensor', 'b=0,0,2'])
     assert chosen_sensors(options) == {'a': (0.0, 0.0, 1.0), 'b': (0.0, 0.0, 2.0)}
 
 
-def test_the_results_of_a_folder_with_a_dot_have_its_whole_name(tmp_path: Path) -> None:
+def test_output_name_keeps_the_dot_of_a_folder(tmp_path: Path) -> None:
     (tmp_path / 'bag_1.5').mkdir()
     (tmp_path / 'one.mcap').touch()
     named = {name: process_bag._stem([str(tmp_path / name)]) for name in ('bag_1.5', 'one.mcap', 'day_*')}
@@ -71,7 +73,7 @@ def test_the_results_of_a_folder_with_a_dot_have_its_whole_name(tmp_path: Path) 
         '-q --range-topics A B BAG --odom-topic O',
     ],
 )
-def test_the_bag_is_found_before_and_behind_the_topics(
+def test_bag_is_found_before_and_after_the_topics(
     parser: Callable[[], argparse.ArgumentParser], form: str, bag: str
 ) -> None:
     options = parser().parse_args([bag if word == 'BAG' else word for word in form.split()])
@@ -89,7 +91,7 @@ def test_the_bag_is_found_before_and_behind_the_topics(
         '--range-topics A B -- BAG BAG other',
     ],
 )
-def test_several_bags_are_found(
+def test_several_bags_are_found_before_and_after_the_topics(
     parser: Callable[[], argparse.ArgumentParser],
     form: str,
     bag: str,
@@ -103,7 +105,7 @@ def test_several_bags_are_found(
 
 
 @pytest.mark.parametrize(
-    ('words', 'told'),
+    ('words', 'expected'),
     [
         (['--start', '-1'], '--start -1: give seconds from the beginning'),
         (['--start', 'nan'], '--start nan'),
@@ -111,12 +113,12 @@ def test_several_bags_are_found(
         (['--duration', 'nan'], '--duration nan'),
     ],
 )
-def test_parts_that_cannot_be(words: list[str], told: str, bag: str) -> None:
-    with pytest.raises(ParameterError, match=told):
+def test_impossible_part_is_rejected_with_reason(words: list[str], expected: str, bag: str) -> None:
+    with pytest.raises(ParameterError, match=expected):
         chosen_part(process_bag.parser().parse_args([bag, *words]))
 
 
-def test_the_bag_is_found_behind_renamings(bag: str) -> None:
+def test_bag_is_found_after_remappings(bag: str) -> None:
     options = replay_bag.parser().parse_args(['--remap', 'a:=b', 'c:=d', bag])
     assert (options.bag, options.remap) == (bag, ['a:=b', 'c:=d'])
     options = replay_bag.parser().parse_args(['--range-topics', 'A', '--remap', 'a:=b', bag])
@@ -125,7 +127,7 @@ def test_the_bag_is_found_behind_renamings(bag: str) -> None:
 
 @pytest.mark.parametrize('parser', PARSERS)
 @pytest.mark.parametrize(
-    ('form', 'told'),
+    ('form', 'expected'),
     [
         ('', 'no bag is given'),
         ('-q', 'no bag is given'),
@@ -134,20 +136,20 @@ def test_the_bag_is_found_behind_renamings(bag: str) -> None:
         ('--range-topics BAG', '--range-topics: expected one word or more before the bag'),
     ],
 )
-def test_no_bag(
+def test_missing_bag_is_rejected(
     parser: Callable[[], argparse.ArgumentParser],
     form: str,
-    told: str,
+    expected: str,
     bag: str,
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     with pytest.raises(SystemExit) as left:
         parser().parse_args([bag if word == 'BAG' else word for word in form.split()])
     assert left.value.code == 2
-    assert told in capsys.readouterr().err
+    assert expected in capsys.readouterr().err
 
 
-def test_the_bag_looks_required() -> None:
+def test_usage_shows_the_bag_as_required() -> None:
     for parser in PARSERS:
         assert ' bag' in parser().format_usage() and '[bag]' not in parser().format_usage()
 
@@ -159,7 +161,9 @@ NODE = [row for row in TABLE if row.group == 'node']
 
 
 @pytest.mark.parametrize('name', [row.name for row in NODE])
-def test_parameters_of_the_node_cannot_be_set(name: str, capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+def test_parameter_of_the_node_is_rejected_on_the_command_line(
+    name: str, capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
     value = {float: '2.5', bool: 'true', int: '3'}.get(next(row.type for row in NODE if row.name == name), 'reliable')
     options = process_bag.parser().parse_args(['bag', '--set', f'{name}={value}'])
     with pytest.raises(ParameterError, match=f'--set {name}: this parameter is only for the node'):
@@ -168,7 +172,7 @@ def test_parameters_of_the_node_cannot_be_set(name: str, capsys: pytest.CaptureF
     assert f'--set {name}: this parameter is only for the node' in capsys.readouterr().err
 
 
-def test_parameters_that_only_the_node_has_are_told_of(
+def test_changed_node_parameters_in_a_file_give_a_warning(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(drawing, 'draw', lambda path, picture: None)
@@ -186,7 +190,7 @@ def test_parameters_that_only_the_node_has_are_told_of(
     assert f'learn: warning: {warning}' in capsys.readouterr().err
 
 
-def test_every_parameter_of_the_node_is_told_of(tmp_path: Path) -> None:
+def test_each_node_parameter_in_a_file_gives_a_warning(tmp_path: Path) -> None:
     other = {float: 3.25, str: 'reliable', tuple: ['x'], int: 3}
     for row in NODE:
         file = tmp_path / f'{row.name}.yaml'
@@ -198,7 +202,7 @@ def test_every_parameter_of_the_node_is_told_of(tmp_path: Path) -> None:
     assert chosen_parameters(process_bag.parser().parse_args(['bag', '--params', str(file)])).warnings == []
 
 
-def test_experiment_tells_of_them_too(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_experiment_warns_of_node_parameters(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     file = tmp_path / 'p.yaml'
     file.write_text('map_frame: map')
     (tmp_path / 'taken').write_text('')
@@ -207,7 +211,7 @@ def test_experiment_tells_of_them_too(tmp_path: Path, capsys: pytest.CaptureFixt
 
 
 @pytest.mark.parametrize('main', [process_bag.main, learn.main, experiment.main, demo.main])
-def test_the_parameters_of_a_call_are_shown_as_a_file(
+def test_dump_config_prints_a_parameter_file(
     main: Callable[..., int],
     tmp_path: Path,
     bag: str,
@@ -226,28 +230,28 @@ def test_the_parameters_of_a_call_are_shown_as_a_file(
 
 
 @pytest.mark.parametrize('main', [process_bag.main, learn.main])
-def test_parameters_are_shown_without_a_bag(main: Callable[..., int], capsys: pytest.CaptureFixture[str]) -> None:
+def test_dump_config_works_without_a_bag(main: Callable[..., int], capsys: pytest.CaptureFixture[str]) -> None:
     assert code_of(main, '--set', 'p_hit=0.55', '--dump-config') == 0
     assert '\n    p_hit: 0.55\n' in capsys.readouterr().out
 
 
 @pytest.mark.parametrize('name', sorted(COMMANDS))
-def test_every_command_tells_its_version(name: str, capsys: pytest.CaptureFixture[str]) -> None:
+def test_command_prints_its_version(name: str, capsys: pytest.CaptureFixture[str]) -> None:
     main = importlib.import_module(f'forward_grid_mapper.{COMMANDS[name][0]}').main
     assert code_of(main, '--version') == 0
     assert capsys.readouterr().out == f'{name} of forward_grid_mapper {__version__}\n'
 
 
 @pytest.mark.parametrize('command', [process_bag, learn, demo, experiment, simulate])
-def test_an_output_without_a_name_is_refused(command: ModuleType, capsys: pytest.CaptureFixture[str]) -> None:
+def test_empty_output_name_is_rejected(command: ModuleType, capsys: pytest.CaptureFixture[str]) -> None:
     words = {experiment: ['door'], simulate: ['door'], demo: []}.get(command, ['MY_BAG'])
     with pytest.raises(SystemExit):
         command.parser().parse_args([*words, '-o', ''])
     assert '-o/--output: the name is empty' in capsys.readouterr().err
 
 
-def test_the_home_of_an_output_is_found(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """As bash leaves it in `--output=~/maps`: a folder whose name is ~ would be made, which nobody dares to remove."""
+def test_home_folder_in_an_output_name_is_expanded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """bash does not expand `--output=~/maps`; a folder with the name ~ would be made, which is dangerous to remove."""
     monkeypatch.setenv('HOME', str(tmp_path))
     assert output_name('~/maps') == str(tmp_path / 'maps')
     for name in ('maps', './~/maps', 'maps~', 'maps/'):

@@ -1,4 +1,4 @@
-"""Every command that a command prints runs as it is printed, whatever the files are called."""
+"""Printed commands run as they are, for any file names."""
 
 from __future__ import annotations
 
@@ -23,12 +23,12 @@ NAMES = ['plain', 'with space', 'a, b', 'it\'s $HOME `x` "y"', 'a;b&c|d>e', '-da
 
 @pytest.fixture(autouse=True)
 def no_picture(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Drawing takes most of the time of a run, and no part in these tests."""
+    """Do not draw: it takes most of the time of a run and is not needed here."""
     monkeypatch.setattr(drawing, 'draw', lambda path, picture: None)
 
 
 def words_of(line: str) -> list[str]:
-    """The words of a line as bash takes them."""
+    """The words of a line as split by bash."""
     bash = shutil.which('bash')
     if bash is None:
         return shlex.split(line)
@@ -38,23 +38,23 @@ def words_of(line: str) -> list[str]:
 
 def commands_in(text: str) -> list[list[str]]:
     """The commands among the lines of an output, without the interpreter and the package."""
-    # what a shell calls the interpreter depends on the folder
+    # the shell's name of the interpreter depends on the folder
     lead = f'{shell.module_line("forward_grid_mapper")} '
     return [words_of(line.strip())[3:] for line in text.splitlines() if line.strip().startswith(lead)]
 
 
 def two_odometries() -> Tape:
-    """The drive with a second odometry, so that one has to be chosen."""
+    """The drive with a second odometry topic, so that one must be chosen."""
     other = [m._replace(frame_id='map', pose=Pose2(m.pose.y, m.pose.x, 1.0)) for m in tape().odometry]
     return tape()._replace(odometry=[*tape().odometry, *other])
 
 
 @pytest.mark.parametrize('name', NAMES)
-def test_simulate_prints_how_to_map(
+def test_simulate_prints_a_command_that_finds_the_bag(
     tmp_path: Path, name: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    # a ~ at the beginning is the home
+    # a leading ~ is the home folder
     output = f'./{name}' if name == '~' else name
     assert code_of(simulate.main, 'door', '--seen', 1, '--sonars', 'front', f'--output={output}') == 0
     ((command, *words),) = commands_in(capsys.readouterr().out)
@@ -64,7 +64,7 @@ def test_simulate_prints_how_to_map(
 
 
 @pytest.mark.parametrize('name', ['with space', "-it's, $HOME"])
-def test_learn_prints_how_to_map_the_same_readings(
+def test_learn_prints_a_command_that_maps_the_same_readings(
     tmp_path: Path, name: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.chdir(tmp_path)
@@ -89,7 +89,7 @@ def test_learn_prints_how_to_map_the_same_readings(
 
 
 @pytest.mark.parametrize('name', [*NAMES, os.fsdecode(b'n\xfft'), 'line\nbreak', "tab\tand 'quote' \\"])
-def test_words_are_what_they_were(name: str) -> None:
+def test_quoted_words_are_unchanged_by_bash(name: str) -> None:
     if shutil.which('bash') is None:
         pytest.skip('there is no bash')
     assert words_of(shell.quoted(name)) == [name]
@@ -98,14 +98,14 @@ def test_words_are_what_they_were(name: str) -> None:
     assert Path(path) == Path(name) and not path.startswith('-')
 
 
-def test_the_interpreter_is_named_as_the_shell_finds_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_printed_interpreter_is_the_one_the_shell_finds(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     for python in (tmp_path / 'my venv' / 'bin' / 'python', tmp_path / 'bin' / 'python3'):
         python.parent.mkdir(parents=True)
         python.touch(0o755)
     monkeypatch.setenv('PATH', str(tmp_path / 'bin'))
     monkeypatch.setattr(shell.sys, 'executable', str(tmp_path / 'bin' / 'python3'))
     assert shell.command_line('learn') == 'python3 -m forward_grid_mapper learn'
-    # no environment is activated
+    # without an activated environment
     monkeypatch.setattr(shell.sys, 'executable', str(tmp_path / 'my venv' / 'bin' / 'python'))
     monkeypatch.chdir(tmp_path / 'bin')
     assert words_of(shell.command_line('learn'))[0] == str(tmp_path / 'my venv' / 'bin' / 'python')

@@ -1,4 +1,4 @@
-"""From a recorded drive to maps, in every form a drive can have; and the options, each against the others."""
+"""From a recorded drive to maps, in all formats, and each option."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from drive_samples import (
     Tape,
     arrays_in,
     assert_same_maps,
-    backwards,
+    backwards_sensors,
     code_of,
     in_turn,
     mapped,
@@ -43,7 +43,7 @@ DRIVE = ('door', '--seen', 1, '--sonars', 'front', '-q')
 
 @pytest.fixture(autouse=True)
 def quick_picture(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Drawing takes most of the time of a run; `plain` and the tests of paths draw for real."""
+    """Do not draw: it takes most of the time of a run. `plain` and the tests of paths do draw."""
     monkeypatch.setattr(drawing, 'draw', lambda path, picture: path.write_bytes(b''))
 
 
@@ -57,7 +57,7 @@ def plain(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def readings_placed(drive: Tape) -> PoseAssociator:
-    """The drive's messages as readings, without any bag."""
+    """The messages of the drive as readings, without a bag."""
     extrinsics = dict(drive.extrinsics)
     associator = PoseAssociator(lambda base, frame, stamp: extrinsics[frame], patient=True)
     for message in drive.odometry:
@@ -68,12 +68,12 @@ def readings_placed(drive: Tape) -> PoseAssociator:
     return associator
 
 
-# ---- what a drive can be recorded as
+# ---- formats of a drive
 
 
 @pytest.mark.parametrize('kind', ['mcap', 'sqlite3', 'ros1'])
 @pytest.mark.parametrize('topics', ['one', 'each'])
-def test_every_format_gives_the_same_maps(tmp_path: Path, plain: Path, kind: str, topics: str) -> None:
+def test_all_formats_give_the_same_maps(tmp_path: Path, plain: Path, kind: str, topics: str) -> None:
     recorded = tmp_path / 'recorded'
     assert code_of(simulate.main, *DRIVE, '-o', recorded, '--format', kind, '--topics', topics) == 0
     if kind == 'ros1':
@@ -91,18 +91,18 @@ def test_every_format_gives_the_same_maps(tmp_path: Path, plain: Path, kind: str
         assert report['counts']['received'] == report['counts']['accepted'] == len(tape().ranges)
 
 
-def test_maps_are_those_of_the_pipeline_without_a_bag(plain: Path) -> None:
+def test_maps_equal_those_of_the_pipeline_without_a_bag(plain: Path) -> None:
     maps = Mapper(Parameters()).run(readings_placed(tape()).readings)
     archive = read_npz(plain / 'maps' / 'maps.npz')
     assert archive.grid == maps.grid
     np.testing.assert_array_equal(archive.ml, maps.ml)
-    # quaternions round the sensors' directions in their last digits
+    # quaternions round the last digits of the directions of the sensors
     np.testing.assert_allclose(archive.live, maps.live, atol=1e-6)
     np.testing.assert_allclose(archive.uncertainty, maps.uncertainty, atol=1e-6)
     assert archive.log_likelihood == pytest.approx(maps.log_likelihood)
 
 
-def test_readings_are_where_the_simulation_took_them() -> None:
+def test_readings_have_the_poses_of_the_simulation() -> None:
     truth = door_drive(1, NOISY, 0, front_array()).readings
     found = readings_placed(tape()).readings
     for column in ('x', 'y', 'yaw', 'z', 'z_max', 'half_angle'):
@@ -110,10 +110,10 @@ def test_readings_are_where_the_simulation_took_them() -> None:
     np.testing.assert_array_equal(found.stamp, truth.stamp)
 
 
-# ---- what is written
+# ---- output
 
 
-def test_all_files_are_there(plain: Path) -> None:
+def test_all_output_files_are_written(plain: Path) -> None:
     folder = plain / 'maps'
     assert {path.name for path in folder.iterdir()} == FILES
     assert (folder / 'maps.png').read_bytes().startswith(b'\x89PNG')
@@ -134,7 +134,7 @@ def test_all_files_are_there(plain: Path) -> None:
     assert {path.name for path in plain.iterdir()} == {'bag', 'maps'}, 'a temporary folder is left'
 
 
-def test_report(plain: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_report_has_topics_frames_and_counts(plain: Path, capsys: pytest.CaptureFixture[str]) -> None:
     report = report_in(plain / 'maps')
     assert report['input']['bag'] == str(plain / 'bag')
     assert report['input']['range_topics'] == ['/sonar']
@@ -151,8 +151,8 @@ def test_report(plain: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert text.count('sonar_') == len(FRAMES)
 
 
-def test_a_drive_before_time_zero(tmp_path: Path, plain: Path) -> None:
-    """Stamps are signed, the times of a log are not."""
+def test_drive_with_negative_stamps_is_mapped(tmp_path: Path, plain: Path) -> None:
+    """Stamps are signed; log times are not."""
     shift = -tape().odometry[0].stamp - 100 * SECOND
     early = tape()._replace(
         odometry=[m._replace(stamp=m.stamp + shift) for m in tape().odometry],
@@ -168,7 +168,7 @@ def test_a_drive_before_time_zero(tmp_path: Path, plain: Path) -> None:
             assert (time, header.stamp.sec) == (0, max(m.stamp for m in early.ranges) // SECOND)
 
 
-def test_bag_of_the_maps(tmp_path: Path, plain: Path) -> None:
+def test_maps_are_written_to_a_bag(tmp_path: Path, plain: Path) -> None:
     mapped(plain / 'bag', tmp_path / 'maps', '--bag')
     assert_same_maps(tmp_path / 'maps', plain / 'maps')
     assert {path.name for path in (tmp_path / 'maps').iterdir()} == FILES | {'maps.mcap_bag'}
@@ -189,7 +189,7 @@ def test_bag_of_the_maps(tmp_path: Path, plain: Path) -> None:
     assert times == {max(m.stamp for m in tape().ranges)}
 
 
-def test_the_default_name_is_free(tmp_path: Path, plain: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_default_output_name_is_unused(tmp_path: Path, plain: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     for name in ('bag_maps', 'bag_maps_2', 'bag_maps_3'):
         before = {path: path.stat().st_mtime_ns for path in tmp_path.rglob('*') if path.is_file()}
@@ -198,14 +198,14 @@ def test_the_default_name_is_free(tmp_path: Path, plain: Path, monkeypatch: pyte
         assert {path: path.stat().st_mtime_ns for path in before} == before
 
 
-def test_a_bag_called_dot(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_output_name_of_the_current_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(write_tape(tmp_path / 'drive', tape()))
     for name in ('drive_maps', 'drive_maps_2'):
         assert code_of(process_bag.main, '.') == 0
         assert FILES == {path.name for path in Path(name).iterdir()}
 
 
-def test_an_empty_folder_is_filled(tmp_path: Path, plain: Path) -> None:
+def test_existing_empty_output_folder_is_filled(tmp_path: Path, plain: Path) -> None:
     folder = tmp_path / 'mounted'
     folder.mkdir()
     inode = folder.stat().st_ino
@@ -214,7 +214,7 @@ def test_an_empty_folder_is_filled(tmp_path: Path, plain: Path) -> None:
     assert {path.name for path in folder.iterdir()} == FILES
 
 
-def test_what_is_printed(tmp_path: Path, plain: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_output_on_the_terminal(tmp_path: Path, plain: Path, capsys: pytest.CaptureFixture[str]) -> None:
     mapped(plain / 'bag', tmp_path / 'a', '-q')
     assert capsys.readouterr() == (f'maps are in {tmp_path / "a"}\n', '')
     mapped(plain / 'bag', tmp_path / 'b')
@@ -224,7 +224,7 @@ def test_what_is_printed(tmp_path: Path, plain: Path, capsys: pytest.CaptureFixt
 
 @pytest.mark.filterwarnings('ignore:Glyph')
 @pytest.mark.parametrize('name', ['with space', 'Büro 日本 😀', r'$x^{\frac', '50% of #1?', '-dash'])
-def test_odd_paths(
+def test_paths_with_unusual_characters(
     tmp_path: Path, plain: Path, name: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.undo()
@@ -237,7 +237,7 @@ def test_odd_paths(
     assert f'maps are in {tmp_path / name / name} file' in capsys.readouterr().out
 
 
-def test_a_path_that_is_no_text(
+def test_path_that_is_not_utf_8(
     tmp_path: Path, plain: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.undo()
@@ -255,7 +255,7 @@ def test_a_path_that_is_no_text(
 # ---- options
 
 
-def test_the_list_of_parameters_changes_nothing(
+def test_listed_parameters_as_a_file_change_no_values(
     tmp_path: Path, plain: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert code_of(process_bag.main, '--list-parameters') == 0
@@ -268,7 +268,7 @@ def test_the_list_of_parameters_changes_nothing(
     assert_same_maps(tmp_path / 'maps', plain / 'maps')
 
 
-def test_set_wins_over_the_file(tmp_path: Path, plain: Path) -> None:
+def test_setting_overrides_the_parameter_file(tmp_path: Path, plain: Path) -> None:
     file = tmp_path / 'p.yaml'
     file.write_text('forward_grid_mapper: {ros__parameters: {resolution: 0.2, alpha: 0.25, publish_rate: 5.0}}')
     of_file = mapped(plain / 'bag', tmp_path / 'a', '--params', file)
@@ -282,13 +282,15 @@ def test_set_wins_over_the_file(tmp_path: Path, plain: Path) -> None:
     assert '0.25' in (tmp_path / 'b' / 'report.txt').read_text('utf-8')
 
 
-def test_a_search_cut_short_says_so(tmp_path: Path, plain: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_search_that_did_not_converge_gives_a_warning(
+    tmp_path: Path, plain: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     report = mapped(plain / 'bag', tmp_path / 'maps', '--set', 'max_iterations=1', '-q')
     assert any('raise max_iterations' in warning for warning in report['warnings'])
     assert 'process_bag: warning: ' in capsys.readouterr().err
 
 
-def test_sensor_wins_over_file_and_transforms(tmp_path: Path, plain: Path) -> None:
+def test_sensor_option_overrides_file_and_transforms(tmp_path: Path, plain: Path) -> None:
     wrong = tuple((frame, Pose2(1.0, 2.0, 3.0)) for frame, _ in tape().extrinsics)
     bag = write_tape(tmp_path / 'bag', tape()._replace(extrinsics=wrong))
     given = {frame: list(pose) for frame, pose in tape().extrinsics}
@@ -308,14 +310,14 @@ def test_sensor_wins_over_file_and_transforms(tmp_path: Path, plain: Path) -> No
     assert some['result'] != alone['result']
 
 
-def test_degrees_and_slashes_in_a_sensor(tmp_path: Path) -> None:
+def test_sensor_option_accepts_degrees_and_slashes(tmp_path: Path) -> None:
     bag = write_tape(tmp_path / 'bag', tape().of(FRAMES[0])._replace(extrinsics=()))
     mapped(bag, tmp_path / 'a', f'--sensor=/{FRAMES[0]}=0.1,-0.2,90deg')
     mapped(bag, tmp_path / 'b', '--sensor', f'{FRAMES[0]}=0.1,-0.2,{np.pi / 2!r}')
     assert_same_maps(tmp_path / 'a', tmp_path / 'b')
 
 
-def test_one_of_two_odometry_topics(tmp_path: Path, plain: Path) -> None:
+def test_one_of_two_odometry_topics_is_used(tmp_path: Path, plain: Path) -> None:
     moved = [m._replace(frame_id='map', pose=Pose2(m.pose.y, m.pose.x, 1.0)) for m in tape().odometry]
     drive = tape()._replace(odometry=[*tape().odometry, *moved])
     bag = write_tape(
@@ -330,7 +332,7 @@ def test_one_of_two_odometry_topics(tmp_path: Path, plain: Path) -> None:
     assert arrays_in(tmp_path / 'of_laser')['ml_map'].shape != arrays_in(plain / 'maps')['ml_map'].shape
 
 
-def test_some_of_the_range_topics(tmp_path: Path) -> None:
+def test_only_chosen_range_topics_are_used(tmp_path: Path) -> None:
     chosen = [FRAMES[5], FRAMES[2]]
     bag = write_tape(tmp_path / 'bag', tape(), sonar_topic=lambda m: f'/sonars/{m.frame_id}')
     topics = [f'/sonars/{frame}' for frame in chosen]
@@ -342,13 +344,13 @@ def test_some_of_the_range_topics(tmp_path: Path) -> None:
     assert_same_maps(tmp_path / 'chosen', tmp_path / 'only_maps')
 
 
-def test_a_sensor_that_sends_zero_is_named(tmp_path: Path) -> None:
+def test_sensor_that_sends_zero_gives_a_warning(tmp_path: Path) -> None:
     dead = [m._replace(range=0.0) if m.frame_id == FRAMES[3] else m for m in tape().ranges]
     report = mapped(write_tape(tmp_path / 'bag', tape()._replace(ranges=dead)), tmp_path / 'maps')
     assert [w for w in report['warnings'] if w.startswith(f'nearly all readings of {FRAMES[3]} were rejected as')]
 
 
-def test_learning(tmp_path: Path, plain: Path) -> None:
+def test_learning_changes_the_parameters_of_the_model(tmp_path: Path, plain: Path) -> None:
     report = mapped(plain / 'bag', tmp_path / 'maps', '--learn', 1)
     before = report_in(plain / 'maps')['parameters']
     learned = {name for name, value in report['parameters'].items() if value != before[name]}
@@ -359,16 +361,16 @@ def test_learning(tmp_path: Path, plain: Path) -> None:
     assert 'learning' in report['seconds']
 
 
-def test_help(capsys: pytest.CaptureFixture[str]) -> None:
+def test_help_lists_all_options(capsys: pytest.CaptureFixture[str]) -> None:
     assert code_of(process_bag.main, '--help') == 0
     text = capsys.readouterr().out
     for option in ('--range-topics', '--odom-topic', '--params', '--set', '--sensor', '--bag', '-o', '--learn'):
         assert option in text
 
 
-def test_poses_that_the_readings_contradict_are_told_of(tmp_path: Path) -> None:
-    """Sensors that look backwards, by transforms of the bag and by what the user gives."""
-    right, wrong = backwards()
+def test_sensor_poses_that_contradict_the_readings_give_a_warning(tmp_path: Path) -> None:
+    """Sensors rotated by 180 degrees, in the transforms of the bag and in options."""
+    right, wrong = backwards_sensors()
     bag = write_tape(tmp_path / 'bag', wrong)
     report = mapped(bag, tmp_path / 'maps')
     expected = 'the sensors seem to be rotated by 180 degrees; check the poses of the sensors on the robot'

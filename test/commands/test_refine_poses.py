@@ -1,4 +1,4 @@
-"""`process_bag --refine-poses`: drives whose odometry drifts, drives that are too short, one of them and several."""
+"""`process_bag --refine-poses`: drives with drift, drives that are too short, one drive and several."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import pytest
-from drive_samples import FILES, assert_same_maps, code_of, mapped, refusal, report_in, tape, write_tape
+from drive_samples import FILES, assert_same_maps, code_of, error_of, mapped, report_in, tape, write_tape
 
 from forward_grid_mapper.commands import process_bag
 from forward_grid_mapper.commands.simulate import write_recording
@@ -32,8 +32,8 @@ from forward_grid_mapper.simulation.world import building_tour, building_world
 REFINED = FILES | {'trajectory.tum', 'odometry.tum', 'odometry_calibration.yaml'}
 
 
-class Kept(NamedTuple):
-    """A drive that drifts, as a bag and as the journal of the node that was there; and what becomes of the bag."""
+class RefinedDrive(NamedTuple):
+    """A drive with drift, as a bag and as a journal of the node, and the results of the bag."""
 
     exact: Recording
     bent: Recording
@@ -44,13 +44,13 @@ class Kept(NamedTuple):
 
 
 def drifting(points: int, seed: int, bent: int) -> tuple[Recording, Recording]:
-    """A drive through rooms with eight sonars, and the same with odometry that drifts."""
+    """A drive through rooms with eight sonars, exact and with odometry that drifts."""
     exact = drive(building_world(), building_tour()[:points], 0.15, sonar_ring(8), NOISY, seed=seed)
     return exact, with_drift(exact, LEVELS['high'], bent)
 
 
 @pytest.fixture(scope='module')
-def kept(tmp_path_factory: pytest.TempPathFactory) -> Kept:
+def refined_drive(tmp_path_factory: pytest.TempPathFactory) -> RefinedDrive:
     folder = tmp_path_factory.mktemp('kept')
     exact, bent = drifting(10, 3, 6)
     journal = Journal(folder / 'journal', print)
@@ -59,21 +59,21 @@ def kept(tmp_path_factory: pytest.TempPathFactory) -> Kept:
     journal.close()
     bag = write_recording(folder, bent)
     report = mapped(bag, folder / 'maps', '--refine-poses', '-q')
-    return Kept(exact, bent, bag, folder / 'journal', report, folder / 'maps')
+    return RefinedDrive(exact, bent, bag, folder / 'journal', report, folder / 'maps')
 
 
-def test_drift_is_taken_out_of_a_bag(kept: Kept) -> None:
-    assert {path.name for path in kept.maps.iterdir()} == REFINED
-    assert kept.report['input']['trajectory']['refined']
-    assert kept.report['input']['trajectory']['odometry_off_m'] > 0.5
-    true = np.array([m.pose for m in kept.exact.odometry])
+def test_drift_of_a_bag_is_removed(refined_drive: RefinedDrive) -> None:
+    assert {path.name for path in refined_drive.maps.iterdir()} == REFINED
+    assert refined_drive.report['input']['trajectory']['refined']
+    assert refined_drive.report['input']['trajectory']['odometry_off_m'] > 0.5
+    true = np.array([m.pose for m in refined_drive.exact.odometry])
     for name, low, high in (('odometry', 0.7, 9.0), ('trajectory', 0.0, 0.2)):
-        lines = np.loadtxt(kept.maps / f'{name}.tum')
+        lines = np.loadtxt(refined_drive.maps / f'{name}.tum')
         assert len(lines) == len(true)
         assert low < rms_after_alignment(lines[:, 1:3], true) < high
 
 
-def test_a_drive_that_is_left_alone_gives_the_same_maps(tmp_path: Path) -> None:
+def test_drive_that_is_not_refined_gives_the_same_maps(tmp_path: Path) -> None:
     write_tape(tmp_path / 'bag', tape())
     mapped(tmp_path / 'bag', tmp_path / 'plain')
     report = mapped(tmp_path / 'bag', tmp_path / 'maps', '--refine-poses')
@@ -84,7 +84,7 @@ def test_a_drive_that_is_left_alone_gives_the_same_maps(tmp_path: Path) -> None:
     assert 'not refined' in (tmp_path / 'maps' / 'report.txt').read_text()
 
 
-def test_without_the_option_nothing_is_said(tmp_path: Path) -> None:
+def test_without_the_option_the_report_has_no_trajectory(tmp_path: Path) -> None:
     write_tape(tmp_path / 'bag', tape())
     report = mapped(tmp_path / 'bag', tmp_path / 'maps', '--set', 'odometry_noise=2deg')
     assert 'trajectory' not in report['input']
@@ -92,7 +92,7 @@ def test_without_the_option_nothing_is_said(tmp_path: Path) -> None:
     assert code_of(process_bag.main, tmp_path / 'bag', '-o', tmp_path / 'maps', '--refine-poses') != 0
 
 
-def test_a_calibration_is_applied(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_given_calibration_is_applied(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     exact = tape()
     wrong = {'scale': 0.03, 'heading': -0.02, 'bias': 0.03, 'turn_scale': 0.0}
     messages = exact.odometry
@@ -113,15 +113,15 @@ def test_a_calibration_is_applied(tmp_path: Path, capsys: pytest.CaptureFixture[
     assert np.hypot(a.x - b.x, a.y - b.y).max() < 0.06
     assert 'with the calibration of' in ' '.join((tmp_path / 'maps' / 'report.txt').read_text().split())
     capsys.readouterr()
-    said = refusal(capsys, tmp_path, tmp_path / 'bag', '-o', tmp_path / 'no', '--odometry-calibration', 'absent')
-    assert 'absent cannot be read' in said
+    error = error_of(capsys, tmp_path, tmp_path / 'bag', '-o', tmp_path / 'no', '--odometry-calibration', 'absent')
+    assert 'absent cannot be read' in error
 
 
 # ---- several drives
 
 
 def drive_of(folder: Path, number: int, points: int, seed: int, bent: int | None) -> tuple[Path, np.ndarray]:
-    """Write the bag of a drive on a day of its own; return it and the true poses."""
+    """Write the bag of a drive on another day; return it and the true poses."""
     exact, recording = drifting(points, seed, bent or 0)
     if bent is None:
         recording = exact
@@ -137,7 +137,7 @@ def drive_of(folder: Path, number: int, points: int, seed: int, bent: int | None
 
 @pytest.fixture(scope='module')
 def days(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
-    """Two drives that drift, and between them a short one that does not; and what becomes of them."""
+    """Two drives with drift, a short one without drift between them, and the results."""
     folder = tmp_path_factory.mktemp('days')
     drives = [drive_of(folder, 0, 10, 3, 6), drive_of(folder, 1, 3, 5, None), drive_of(folder, 2, 10, 4, 8)]
     bags = [bag for bag, _ in drives]
@@ -146,15 +146,15 @@ def days(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
 
 
 @pytest.mark.slow
-def test_each_of_several_drives_is_judged_for_itself(days: dict[str, Any]) -> None:
+def test_each_drive_is_judged_separately(days: dict[str, Any]) -> None:
     report = report_in(days['maps'])
-    told = [drive['trajectory'] for drive in report['drives']]
-    assert [found['refined'] for found in told] == [True, False, True]
-    assert 'm long' in told[1]['reason']
+    trajectories = [drive['trajectory'] for drive in report['drives']]
+    assert [found['refined'] for found in trajectories] == [True, False, True]
+    assert 'm long' in trajectories[1]['reason']
     files = {f'{kind}_{number}.tum' for kind in ('trajectory', 'odometry') for number in (1, 3)}
     files |= {f'odometry_calibration_{number}.yaml' for number in (1, 3)}
     assert {path.name for path in days['maps'].iterdir()} == FILES | files
-    assert [found['file'] for found in told] == ['trajectory_1.tum', '', 'trajectory_3.tum']
+    assert [found['file'] for found in trajectories] == ['trajectory_1.tum', '', 'trajectory_3.tum']
     text = ' '.join((days['maps'] / 'report.txt').read_text().split())
     assert '2 of 3 refined, see the drives' in text
     assert "trajectory odometry's, not refined: the drive is" in text
@@ -162,10 +162,10 @@ def test_each_of_several_drives_is_judged_for_itself(days: dict[str, Any]) -> No
 
 
 @pytest.mark.slow
-def test_drives_that_are_refined_fit_those_that_are_not(days: dict[str, Any]) -> None:
+def test_refined_drives_fit_those_that_are_not_refined(days: dict[str, Any]) -> None:
     found = [np.loadtxt(days['maps'] / f'trajectory_{number}.tum')[:, 1:3] for number in (1, 3)]
     for poses, true in zip(found, (days['true'][0], days['true'][2]), strict=True):
-        # no alignment: the short drive says where the map is to be
+        # no alignment: the short drive determines the position of the map
         off = np.hypot(*(poses - true[:, :2]).T)
         assert np.sqrt((off**2).mean()) < 0.15
     plain = read_drives(days['bags'], Parameters(), {}).readings
@@ -177,7 +177,7 @@ def test_drives_that_are_refined_fit_those_that_are_not(days: dict[str, Any]) ->
 
 
 @pytest.mark.slow
-def test_drives_that_all_stay_make_the_same_maps(days: dict[str, Any], tmp_path: Path) -> None:
+def test_drives_that_are_all_not_refined_give_the_same_maps(days: dict[str, Any], tmp_path: Path) -> None:
     other = drive_of(tmp_path, 4, 3, 8, None)[0]
     bags = [days['bags'][1], other]
     for name, options in (('plain', []), ('maps', ['--refine-poses'])):
@@ -191,21 +191,21 @@ def test_drives_that_all_stay_make_the_same_maps(days: dict[str, Any], tmp_path:
 
 
 @pytest.mark.slow
-def test_a_journal_is_refined_as_the_bag_is(tmp_path: Path, kept: Kept) -> None:
-    sensors = [f'--sensor={frame}={x},{y},{yaw}' for frame, (x, y, yaw) in kept.bent.extrinsics]
-    of_journal = mapped(kept.journal, tmp_path / 'journal', '--refine-poses', '-q', *sensors)
-    told = [report['input']['trajectory'] for report in (kept.report, of_journal)]
-    assert all(found['refined'] for found in told)
-    assert told[1]['odometry_off_m'] == pytest.approx(told[0]['odometry_off_m'], abs=0.05)
-    a, b = (np.loadtxt(folder / 'trajectory.tum') for folder in (kept.maps, tmp_path / 'journal'))
-    assert len(a) > len(b) == len(np.unique(kept.bent.readings.stamp))
+def test_journal_is_refined_like_the_bag(tmp_path: Path, refined_drive: RefinedDrive) -> None:
+    sensors = [f'--sensor={frame}={x},{y},{yaw}' for frame, (x, y, yaw) in refined_drive.bent.extrinsics]
+    of_journal = mapped(refined_drive.journal, tmp_path / 'journal', '--refine-poses', '-q', *sensors)
+    trajectories = [report['input']['trajectory'] for report in (refined_drive.report, of_journal)]
+    assert all(found['refined'] for found in trajectories)
+    assert trajectories[1]['odometry_off_m'] == pytest.approx(trajectories[0]['odometry_off_m'], abs=0.05)
+    a, b = (np.loadtxt(folder / 'trajectory.tum') for folder in (refined_drive.maps, tmp_path / 'journal'))
+    assert len(a) > len(b) == len(np.unique(refined_drive.bent.readings.stamp))
     at = np.stack([np.interp(b[:, 0], a[:, 0], a[:, k]) for k in (1, 2)], 1)
-    # about its begin a trajectory may swing a little
+    # near its begin a trajectory may vary a little
     assert rms_after_alignment(b[:, 1:3], at) < 0.1
     assert any('they are used to compute odometry' in warning for warning in of_journal['warnings'])
 
 
-def test_a_journal_without_poses_of_the_sensors_stays(tmp_path: Path, kept: Kept) -> None:
-    found = mapped(kept.journal, tmp_path / 'maps', '--refine-poses', '-q')['input']['trajectory']
+def test_journal_without_sensor_poses_is_not_refined(tmp_path: Path, refined_drive: RefinedDrive) -> None:
+    found = mapped(refined_drive.journal, tmp_path / 'maps', '--refine-poses', '-q')['input']['trajectory']
     assert not found['refined']
     assert 'give their poses with --sensor' in found['reason']

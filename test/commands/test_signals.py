@@ -1,4 +1,4 @@
-"""Ctrl-C, SIGTERM and SIGHUP at any moment: one line, exit code 128 plus the signal, nothing and nobody left behind."""
+"""Ctrl-C, SIGTERM and SIGHUP at any time: one line, exit code 128 plus the signal, and no files or processes left."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ import forward_grid_mapper.__main__ as entry
 sys.argv = [command, *sys.argv[4:]]
 sys.exit(getattr(entry, command)())
 """
-"""Starts a command as its installed script does, and interrupts it at the import of a module."""
+"""Starts a command like its installed script and interrupts it at the import of a module."""
 
 COMMANDS = {
     'process_bag': ('bag',),
@@ -72,7 +72,7 @@ def interrupted(
 
 @pytest.mark.parametrize('number', [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
 @pytest.mark.parametrize('command', sorted(COMMANDS))
-def test_while_the_command_is_imported(tmp_path: Path, command: str, number: signal.Signals) -> None:
+def test_signal_during_the_import_ends_the_command(tmp_path: Path, command: str, number: signal.Signals) -> None:
     module = {'mapper': 'forward_grid_mapper.node.main'}.get(command, 'numpy')
     done = interrupted(tmp_path, module, number, command, *COMMANDS[command])
     assert (done.returncode, done.stdout) == (128 + number, '')
@@ -82,25 +82,25 @@ def test_while_the_command_is_imported(tmp_path: Path, command: str, number: sig
 
 @pytest.mark.parametrize('number', [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
 @pytest.mark.parametrize('module', ['numba', 'yaml', 'rosbags', 'argparse'])
-def test_at_other_imports(tmp_path: Path, module: str, number: signal.Signals) -> None:
+def test_signal_during_other_imports_ends_the_command(tmp_path: Path, module: str, number: signal.Signals) -> None:
     done = interrupted(tmp_path, module, number, 'process_bag', 'bag')
     assert (done.returncode, done.stderr) == (128 + number, 'process_bag: cancelled; nothing was written\n')
 
 
 @pytest.mark.parametrize('number', [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
-def test_in_the_middle_of_the_work(tmp_path: Path, number: signal.Signals) -> None:
-    """Matplotlib is imported when the maps have been written into the temporary folder."""
+def test_signal_during_the_work_leaves_no_files(tmp_path: Path, number: signal.Signals) -> None:
+    """Matplotlib is imported after the maps were written to the temporary folder."""
     bag = write_tape(tmp_path / 'bag', tape())
     before = everything_in(tmp_path)
     done = interrupted(tmp_path, 'matplotlib', number, 'process_bag', bag, '-q', '-o', tmp_path / 'new' / 'maps')
     assert (done.returncode, done.stdout) == (128 + number, '')
-    # whoever runs this test alone has no kernels yet
-    said = done.stderr.removeprefix('compiling kernels; this takes half a minute and is done once\n')
-    assert said == 'process_bag: cancelled; nothing was written\n'
+    # if this test runs alone, kernels must be compiled
+    message = done.stderr.removeprefix('compiling kernels; this takes half a minute and is done once\n')
+    assert message == 'process_bag: cancelled; nothing was written\n'
     assert everything_in(tmp_path) == before
 
 
-def test_a_second_signal_does_not_interrupt_the_clean_up(capsys: pytest.CaptureFixture[str]) -> None:
+def test_second_signal_does_not_interrupt_the_clean_up(capsys: pytest.CaptureFixture[str]) -> None:
     cleaned = []
 
     def body(options: object) -> int:
@@ -120,8 +120,8 @@ def test_a_second_signal_does_not_interrupt_the_clean_up(capsys: pytest.CaptureF
 
 
 @pytest.mark.parametrize('fails', [False, True])
-def test_where_c_code_calls_python(capsys: pytest.CaptureFixture[str], fails: bool) -> None:
-    """As the compiler of kernels does: what is raised there is printed as ignored, and the compiler may fail of it."""
+def test_signal_in_a_callback_of_c_code_ends_the_command(capsys: pytest.CaptureFixture[str], fails: bool) -> None:
+    """As in the compiler of kernels: an exception there is printed as ignored, and the compiler may fail."""
     callback = ctypes.CFUNCTYPE(None)(lambda: signal.raise_signal(signal.SIGTERM))
 
     def body(options: object) -> int:
@@ -139,8 +139,8 @@ def test_where_c_code_calls_python(capsys: pytest.CaptureFixture[str], fails: bo
     assert sys.unraisablehook is before
 
 
-def test_signals_that_are_ignored_stay_ignored(capsys: pytest.CaptureFixture[str]) -> None:
-    """As `nohup` and shells without job control have it for commands in the background."""
+def test_ignored_signals_stay_ignored(capsys: pytest.CaptureFixture[str]) -> None:
+    """As with `nohup`, and in shells without job control for background commands."""
 
     def body(options: object) -> int:
         signal.raise_signal(signal.SIGINT)
@@ -168,7 +168,7 @@ def wait_for(what: Callable[[], object], seconds: float = 90.0) -> None:
 
 
 def running(command: str, folder: Path) -> list[int]:
-    """Processes of one of our commands whose command line names a folder."""
+    """Processes of one of our commands with a folder in their command line."""
     found = []
     for process in Path('/proc').glob('[0-9]*'):
         try:
@@ -182,7 +182,7 @@ def running(command: str, folder: Path) -> list[int]:
 
 @pytest.mark.skipif(not Path('/proc/self/cmdline').exists(), reason='there is no /proc')
 @pytest.mark.parametrize('number', [signal.SIGTERM, signal.SIGINT, signal.SIGKILL])
-def test_the_demo_leaves_no_node_behind(tmp_path: Path, number: signal.Signals) -> None:
+def test_interrupted_demo_leaves_no_node_running(tmp_path: Path, number: signal.Signals) -> None:
     pytest.importorskip('rclpy', reason='rclpy is not installed (the extra ros, or a sourced ROS 2)')
     folder = tmp_path / 'out'
     command = [sys.executable, '-m', 'forward_grid_mapper', 'demo', '-o', str(folder)]
@@ -204,8 +204,8 @@ def test_the_demo_leaves_no_node_behind(tmp_path: Path, number: signal.Signals) 
 
 @pytest.mark.skipif(not Path('/proc/self/task').exists(), reason='there is no /proc')
 @pytest.mark.parametrize('number', [signal.SIGINT, signal.SIGTERM])
-def test_drives_that_are_made_at_once_end_with_the_command(tmp_path: Path, number: signal.Signals) -> None:
-    """Ctrl-C as a terminal sends it, to all of its processes; the drives would take minutes."""
+def test_interrupted_simulation_ends_its_child_processes(tmp_path: Path, number: signal.Signals) -> None:
+    """A terminal sends Ctrl-C to all processes; the drives would take minutes."""
     options = ('campus', '--drives', '2', '--jobs', '2', '--readings', '1000000', '-q', '-o', str(tmp_path / 'out'))
     command = [sys.executable, '-m', 'forward_grid_mapper', 'simulate', *options]
     made = subprocess.Popen(
@@ -216,7 +216,7 @@ def test_drives_that_are_made_at_once_end_with_the_command(tmp_path: Path, numbe
         return Path(f'/proc/{made.pid}/task/{made.pid}/children').read_text('ascii').split()
 
     try:
-        # those that make drives, and the one with which multiprocessing keeps its resources
+        # those that make drives, and the resource tracker of multiprocessing
         wait_for(lambda: len(children()) == 3)
         os.killpg(made.pid, number) if number == signal.SIGINT else made.send_signal(number)
         _, err = made.communicate(timeout=20)
@@ -227,7 +227,7 @@ def test_drives_that_are_made_at_once_end_with_the_command(tmp_path: Path, numbe
     assert everything_in(tmp_path) == []
 
 
-def test_a_child_ends_with_its_parent() -> None:
+def test_child_ends_with_its_parent() -> None:
     child = start_child(['mapper', '--help'], environment(), stdout=subprocess.DEVNULL)
     assert child.wait(60) == 0, 'a command that is done does not wait for its parent'
     assert child.stdin is not None

@@ -1,4 +1,4 @@
-"""`simulate`: the recording, its true map and path, and wrong options."""
+"""`simulate`: the recording, the true map and path, and wrong options."""
 
 from __future__ import annotations
 
@@ -22,7 +22,9 @@ SMALL = ('door', '--seen', 1, '--sonars', 'front')
 
 
 @pytest.mark.parametrize(('kind', 'name'), [('mcap', 'bag'), ('sqlite3', 'bag'), ('ros1', 'drive.bag')])
-def test_the_recording(tmp_path: Path, kind: str, name: str, capsys: pytest.CaptureFixture[str]) -> None:
+def test_recording_with_map_and_trajectory_is_written(
+    tmp_path: Path, kind: str, name: str, capsys: pytest.CaptureFixture[str]
+) -> None:
     folder = tmp_path / 'drive'
     assert code_of(simulate.main, *SMALL, '-o', folder, '--format', kind) == 0
     assert {path.name for path in folder.iterdir()} == {name, 'reference.yaml', 'reference.pgm', 'trajectory.csv'}
@@ -42,7 +44,7 @@ def test_the_recording(tmp_path: Path, kind: str, name: str, capsys: pytest.Capt
     np.testing.assert_allclose(path_xy, robot[:, :2], atol=1e-4)
 
 
-def test_drift_leaves_the_true_trajectory_beside_it(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_drift_writes_the_true_trajectory_as_well(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     folder = tmp_path / 'drive'
     assert code_of(simulate.main, *SMALL, '--drift', 'high', '-o', folder) == 0
     assert 'reference.tum, the true trajectory for evo' in capsys.readouterr().out
@@ -57,7 +59,7 @@ def test_drift_leaves_the_true_trajectory_beside_it(tmp_path: Path, capsys: pyte
     assert off[0] < 1e-6 and off.max() > 0.02
 
 
-def test_options_change_the_recording(tmp_path: Path) -> None:
+def test_each_option_changes_the_recording(tmp_path: Path) -> None:
     recordings = {}
     for options in ((), ('--seed', 1), ('--noise-free',), ('--seen', 2), ('--sonars', 'ring')):
         folder = tmp_path / '-'.join(map(str, ('drive', *options)))
@@ -71,7 +73,7 @@ def test_options_change_the_recording(tmp_path: Path) -> None:
         assert list(bag.messages(bag.choose_topics())) == first
 
 
-def test_the_corridor_can_be_mapped(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_simulated_corridor_can_be_mapped(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert code_of(simulate.main, 'corridor', '--sonars', 'front', '-q', '-o', tmp_path / 'drive') == 0
     assert capsys.readouterr() == ('', '')
     report = mapped(tmp_path / 'drive' / 'bag', tmp_path / 'maps')
@@ -91,7 +93,7 @@ def test_the_corridor_can_be_mapped(tmp_path: Path, capsys: pytest.CaptureFixtur
         (('door', '--format', 'zip'), 2, 'mcap'),
     ],
 )
-def test_wrong_options(
+def test_wrong_option_is_rejected_with_reason(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], options: tuple[object, ...], code: int, expected: str
 ) -> None:
     assert code_of(simulate.main, *options, '-o', tmp_path / 'drive') == code
@@ -113,7 +115,7 @@ def test_wrong_options(
         ),
     ],
 )
-def test_what_the_memory_does_not_hold(
+def test_lack_of_memory_is_reported_with_a_remedy(
     tmp_path: Path,
     capsys: pytest.CaptureFixture[str],
     monkeypatch: pytest.MonkeyPatch,
@@ -122,7 +124,7 @@ def test_what_the_memory_does_not_hold(
     work: str,
     advice: str,
 ) -> None:
-    """What is said of maps (a coarser resolution) would be of no use here."""
+    """The usual advice for maps, a coarser resolution, does not help here."""
 
     def too_large(*unused: object, **options: object) -> None:
         raise MemoryError
@@ -136,12 +138,12 @@ def test_what_the_memory_does_not_hold(
     assert everything_in(tmp_path) == []
 
 
-def test_an_output_folder_must_be_given(capsys: pytest.CaptureFixture[str]) -> None:
+def test_output_folder_is_required(capsys: pytest.CaptureFixture[str]) -> None:
     assert code_of(simulate.main, 'door') == 2
     assert '--output' in capsys.readouterr().err
 
 
-def test_nothing_is_overwritten(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_existing_files_are_not_overwritten(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (tmp_path / 'mine.txt').write_text('mine')
     for path in (tmp_path, tmp_path / 'mine.txt', tmp_path / 'mine.txt' / 'drive'):
         assert code_of(simulate.main, *SMALL, '-q', '-o', path) == 1
@@ -150,7 +152,7 @@ def test_nothing_is_overwritten(tmp_path: Path, capsys: pytest.CaptureFixture[st
     assert everything_in(tmp_path) == [str(tmp_path / 'mine.txt')]
 
 
-def test_a_sqlite3_bag_that_cannot_be_there(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_sqlite3_bag_with_a_bad_path_is_rejected(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert code_of(simulate.main, *SMALL, '--format', 'sqlite3', '-o', tmp_path / 'what?') == 1
     err = capsys.readouterr().err
     assert 'cannot have ?, # or %' in err
@@ -161,7 +163,7 @@ def test_a_sqlite3_bag_that_cannot_be_there(tmp_path: Path, capsys: pytest.Captu
 CAMPUS = ('campus', '--buildings', 1, '--drives', 2, '--readings', 160, '--sonars', 'front', '-q')
 
 
-def test_a_campus_is_a_folder_of_drives_however_many_are_made_at_once(tmp_path: Path) -> None:
+def test_drives_of_a_campus_do_not_depend_on_the_number_of_jobs(tmp_path: Path) -> None:
     for jobs in (1, 2):
         assert code_of(simulate.main, *CAMPUS, '--jobs', jobs, '-o', tmp_path / str(jobs)) == 0
     assert sorted(path.name for path in (tmp_path / '1' / 'drives').iterdir()) == ['drive_0000', 'drive_0001']
@@ -177,11 +179,11 @@ def test_a_campus_is_a_folder_of_drives_however_many_are_made_at_once(tmp_path: 
 
 
 @pytest.mark.parametrize('option', [('--drives', 0), ('--buildings', 0), ('--readings', -1), ('--jobs', 0)])
-def test_a_campus_without_anything_in_it(tmp_path: Path, option: tuple[str, int]) -> None:
+def test_campus_without_buildings_drives_or_readings_is_rejected(tmp_path: Path, option: tuple[str, int]) -> None:
     assert code_of(simulate.main, *CAMPUS, *option, '-o', tmp_path / 'campus') == 1
     assert not (tmp_path / 'campus').exists()
 
 
-def test_a_process_that_is_ended_from_outside_is_told_of() -> None:
+def test_killed_process_is_reported() -> None:
     with pytest.raises(ClusterError, match=r'fewer drives in parallel \(--jobs\)'):
         list(simulate.at_once(os._exit, [1, 1], 2))

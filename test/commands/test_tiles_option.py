@@ -6,18 +6,18 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from drive_samples import FILES, arrays_in, mapped, refusal, tape, write_tape
+from drive_samples import FILES, arrays_in, error_of, mapped, tape, write_tape
 
 from forward_grid_mapper.files import drawing
 
 
 @pytest.fixture(autouse=True)
 def quick_picture(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Drawing takes most of the time of a run."""
+    """Do not draw: it takes most of the time of a run."""
     monkeypatch.setattr(drawing, 'draw', lambda path, picture: path.write_bytes(b''))
 
 
-def test_maps_in_tiles_are_written_as_others_are(tmp_path: Path) -> None:
+def test_maps_in_tiles_have_the_same_output_files(tmp_path: Path) -> None:
     bag = write_tape(tmp_path / 'bag', tape())
     whole, tiled = mapped(bag, tmp_path / 'whole'), mapped(bag, tmp_path / 'tiled', '--tiles', 3)
     assert {path.name for path in (tmp_path / 'tiled').iterdir()} == FILES
@@ -31,8 +31,8 @@ def test_maps_in_tiles_are_written_as_others_are(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize('size', ['0', '-5', 'nan', 'inf'])
-def test_tiles_that_cannot_be(tmp_path: Path, size: str, capsys: pytest.CaptureFixture[str]) -> None:
+def test_impossible_size_of_tiles_is_rejected(tmp_path: Path, size: str, capsys: pytest.CaptureFixture[str]) -> None:
     bag = write_tape(tmp_path / 'bag', tape())
-    assert f'--tiles {size}: give the edge' in refusal(
+    assert f'--tiles {size}: give the edge' in error_of(
         capsys, tmp_path, bag, '-o', tmp_path / 'maps', f'--tiles={size}'
     )

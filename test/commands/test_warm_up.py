@@ -1,4 +1,4 @@
-"""The command that fills the cache of kernels."""
+"""The command that compiles all kernels."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from forward_grid_mapper.core import warm_up
 COMMAND = (sys.executable, '-m', 'forward_grid_mapper', 'warm_up')
 
 
-def test_after_it_there_is_nothing_to_compile() -> None:
+def test_second_warm_up_compiles_nothing() -> None:
     for _ in range(2):
         done = subprocess.run(COMMAND, capture_output=True, text=True, check=True, env=dict(os.environ), timeout=600)
     assert 'nothing to compile' in done.stdout
@@ -26,8 +26,8 @@ def test_after_it_there_is_nothing_to_compile() -> None:
     ]
 
 
-def test_the_tests_begin_with_this_file(request: pytest.FixtureRequest) -> None:
-    """`test/conftest.py` puts it first, by its name."""
+def test_this_file_runs_first(request: pytest.FixtureRequest) -> None:
+    """`test/conftest.py` sorts it first, by its name."""
     assert request.session.items[0].path == Path(__file__)
 
 
@@ -46,7 +46,7 @@ def signatures():
 
 
 @pytest.mark.slow
-def test_a_trajectory_and_its_maps_need_no_more_kernels() -> None:
+def test_refinement_after_warm_up_compiles_nothing() -> None:
     program = f"""{SIGNATURES}
 warm_up()
 before = signatures()
@@ -84,7 +84,7 @@ print(len(found.readings) > 0, len(before) > 2, [kernel for _, kernel, _ in sign
     assert done.stdout.split() == ['True', 'True', '[]'], done.stdout
 
 
-def test_the_live_map_needs_no_kernel_of_the_others(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_warm_up_of_the_live_map_compiles_no_other_kernels(monkeypatch: pytest.MonkeyPatch) -> None:
     def refuse(*arguments: object, **options: object) -> None:
         raise AssertionError('not needed for the live map')
 

@@ -1,4 +1,4 @@
-"""Which readings of the drives on a command line are mapped: each once, and those of the part that was asked for."""
+"""Readings that are mapped: each once, and only those in the requested part of the drive."""
 
 from __future__ import annotations
 
@@ -21,8 +21,8 @@ def read(*paths: Path, **options: Any) -> Drives:
     return read_drives(paths, Parameters(), {}, **options)
 
 
-def test_of_a_bag_and_one_of_its_files_the_bag_is_read(tmp_path: Path) -> None:
-    """The file may hold a half of the drive."""
+def test_bag_and_one_of_its_files_are_read_as_the_bag(tmp_path: Path) -> None:
+    """The file may have only half of the drive."""
     whole = tape()
     halves = in_turn(whole)[::2], in_turn(whole)[1::2]
     bag = write_tape(tmp_path / 'bag', whole, logged=halves[0])
@@ -36,7 +36,7 @@ def test_of_a_bag_and_one_of_its_files_the_bag_is_read(tmp_path: Path) -> None:
         assert sum('it is read once' in warning for warning in drives.source['warnings']) == len(words) - 1
 
 
-def test_a_topic_and_its_filtered_copy_are_named_with_the_option_to_choose(tmp_path: Path) -> None:
+def test_topic_and_its_filtered_copy_are_named_with_an_option(tmp_path: Path) -> None:
     drive = tape()
     filtered = [m._replace(range=m.range + 0.01) if math.isfinite(m.range) else m._replace() for m in drive.ranges]
     copies = {id(message) for message in filtered}
@@ -50,13 +50,13 @@ def test_a_topic_and_its_filtered_copy_are_named_with_the_option_to_choose(tmp_p
 
 
 @pytest.mark.parametrize('first', [1_700_000_000_123_456_789, 1_700_000_000_123_456_790 + 100])
-def test_a_part_begins_and_ends_to_the_nanosecond(first: int) -> None:
+def test_bounds_of_a_part_are_exact_to_the_nanosecond(first: int) -> None:
     assert Part(0.0, 60.0).bounds(first) == (first, first + 60 * NANOSECONDS)
     assert Part(1.5).bounds(first) == (first + 3 * NANOSECONDS // 2, math.inf)
     assert Part(1e300, 1e308).bounds(first)[1] == math.inf
 
 
-def test_a_part_where_the_first_message_has_no_stamp(tmp_path: Path) -> None:
+def test_part_of_a_drive_whose_first_message_has_no_stamp(tmp_path: Path) -> None:
     drive = tape()
     unstamped = drive._replace(odometry=[drive.odometry[0]._replace(stamp=0), *drive.odometry[1:]])
     logged = [(drive.odometry[0].stamp, unstamped.odometry[0]), *in_turn(unstamped)[1:]]
@@ -68,7 +68,7 @@ def test_a_part_where_the_first_message_has_no_stamp(tmp_path: Path) -> None:
         read(path, part=Part(900.0))
 
 
-def test_a_part_of_a_drive_without_stamps(tmp_path: Path) -> None:
+def test_part_of_a_drive_without_stamps_is_rejected(tmp_path: Path) -> None:
     drive = tape().with_ranges(stamp=0).with_odometry(stamp=0)
     path = write_tape(tmp_path / 'bag', drive, logged=[(k + 1, m) for k, (_, m) in enumerate(in_turn(drive))])
     with pytest.raises(InputError, match='no reading in the part'):

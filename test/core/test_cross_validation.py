@@ -1,4 +1,4 @@
-"""Readings that are held out: which they are, what they are asked, and that they have no part in learning."""
+"""Held-out readings: how they are chosen and judged, and that learning does not use them."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from forward_grid_mapper.simulation.sonar import NOISY, front_array
 READINGS = door_drive(1, NOISY, 0, front_array()).readings
 
 
-def test_every_reading_is_held_out_once_with_those_about_it() -> None:
+def test_each_reading_is_held_out_once_together_with_its_block() -> None:
     fold = folds_of(READINGS)
     assert set(fold.tolist()) == set(range(FOLDS))
     blocks = (READINGS.stamp - READINGS.stamp.min()) // 2_000_000_000
@@ -33,7 +33,7 @@ def test_every_reading_is_held_out_once_with_those_about_it() -> None:
         assert len(set(fold[blocks == block].tolist())) == 1
 
 
-def test_readings_held_out_have_no_part_in_learning(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_held_out_readings_are_not_used_in_learning(monkeypatch: pytest.MonkeyPatch) -> None:
     learned_from: list[set[int]] = []
     judged: list[set[int]] = []
 
@@ -54,7 +54,7 @@ def test_readings_held_out_have_no_part_in_learning(monkeypatch: pytest.MonkeyPa
     assert set().union(*judged) == set(READINGS.stamp.tolist())
 
 
-def test_the_likelihood_is_that_of_a_map_on_any_grid() -> None:
+def test_likelihood_does_not_depend_on_the_grid() -> None:
     maps = Mapper(Parameters()).run(READINGS)
     whole = log_likelihoods(READINGS, maps, maps.parameters.model)
     assert whole.sum() == pytest.approx(maps.log_likelihood, abs=1e-6)
@@ -64,14 +64,14 @@ def test_the_likelihood_is_that_of_a_map_on_any_grid() -> None:
     np.testing.assert_allclose(log_likelihoods(rest, part, part.parameters.model), alone, atol=1e-9)
 
 
-def test_the_standard_error_is_that_of_sums_of_blocks() -> None:
-    """Where all readings of a block say the same, more of them make nothing surer."""
+def test_standard_error_is_that_of_sums_of_blocks() -> None:
+    """If all readings of a block have the same value, more of them do not reduce the error."""
     blocks = blocks_of(READINGS)
     _, number = np.unique(blocks, return_inverse=True)
     count = number.max() + 1
     values = np.random.default_rng(3).normal(size=count)[number]
     found = standard_error(READINGS, values)
-    # brute force: the spread of the mean over bootstraps of blocks
+    # brute force: the standard deviation of the mean over bootstraps of blocks
     rng, means = np.random.default_rng(4), []
     for _ in range(4000):
         drawn = rng.integers(0, count, count)
@@ -94,11 +94,11 @@ def test_the_standard_error_is_that_of_sums_of_blocks() -> None:
         (CrossValidation(1.0, 1.0, 3.0, 0.9, 0.01, 0.01), False),
     ],
 )
-def test_a_map_has_to_be_better_by_both_values_and_by_more_than_chance(seen: CrossValidation, better: bool) -> None:
+def test_map_must_be_better_by_both_values_beyond_chance(seen: CrossValidation, better: bool) -> None:
     assert seen.better == better
 
 
-def test_a_short_drive_is_told_of() -> None:
+def test_short_drive_gives_a_warning_of_no_test() -> None:
     first = READINGS.select(READINGS.stamp < READINGS.stamp.min() + 5_000_000_000)
     assert cross_validated(first, Parameters(), 1) is None
     found = learn_jointly(first, Parameters(), 1, keep_going=True)
@@ -107,7 +107,7 @@ def test_a_short_drive_is_told_of() -> None:
     assert 'no readings could be held out' in kept.warnings[-1]
 
 
-def test_values_are_accepted_where_the_first_ones_are_wrong_and_refused_where_they_are_good() -> None:
+def test_values_are_accepted_only_if_the_first_ones_are_wrong() -> None:
     """The simulated sonar has a noise of 5 cm."""
     readings = door_drive(3, NOISY, 0).readings
     for given, accepted in (({'sigma': 0.6}, True), ({}, False)):

@@ -1,4 +1,4 @@
-"""The default pipeline against plain Python: normals, gains, the end of the search, the maps that are handed out."""
+"""The default pipeline, compared with plain Python: normals, gains, the end of the search, and the final maps."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ SEEDS = range(3)
 
 
 def corner(seed: int, count: int = 70) -> Readings:
-    """Readings of a robot in the corner of two walls; at a slant they hear nothing, and some are random."""
+    """Readings of a robot in the corner of two walls; at large incidence they have no echo, and some are random."""
     rng = np.random.default_rng(seed)
     x, y = 0.3 + 0.5 * rng.random(count), 0.3 + 0.5 * rng.random(count)
     yaw = rng.uniform(-0.6, 2.2, count)
@@ -49,19 +49,19 @@ def corner(seed: int, count: int = 70) -> Readings:
 
 @dataclass(frozen=True)
 class Case:
-    """The default maps of some readings, and the map that the search found."""
+    """The default maps of some readings, and the map found by the search."""
 
     maps: MapSet
     searched: np.ndarray
     traversed: np.ndarray
 
     @property
-    def told(self) -> tuple[Readings, Grid, np.ndarray]:
+    def inputs(self) -> tuple[Readings, Grid, np.ndarray]:
         return self.maps.readings, self.maps.grid, self.searched
 
     @property
     def passes(self) -> np.ndarray:
-        return naive.passed(*self.told, self.maps.parameters.model)
+        return naive.passed(*self.inputs, self.maps.parameters.model)
 
     @property
     def prior(self) -> Prior:
@@ -79,13 +79,13 @@ def case(seed: int) -> Case:
 
 @cache
 def evidence(seed: int) -> np.ndarray:
-    """That of every cell, given the map that the search found, from sums over all correspondences."""
+    """Evidence of each cell, given the map found by the search, from sums over all correspondences."""
     c = case(seed)
-    return naive.evidence(*c.told, c.maps.parameters.model, c.maps.normals)
+    return naive.evidence(*c.inputs, c.maps.parameters.model, c.maps.normals)
 
 
 @pytest.mark.parametrize('seed', SEEDS)
-def test_normals(seed: int) -> None:
+def test_normals_are_those_of_the_twin(seed: int) -> None:
     maps = case(seed).maps
     sums = naive.normals(maps.readings, maps.grid, maps.parameters.model)
     cosine, sine, mass = (naive.box_sum(values) for values in sums)
@@ -99,15 +99,15 @@ def test_normals(seed: int) -> None:
 
 
 @pytest.mark.parametrize('seed', SEEDS)
-def test_the_likelihood_and_the_objective(seed: int) -> None:
+def test_likelihood_and_objective_are_those_of_the_twin(seed: int) -> None:
     c = case(seed)
     maps, model = c.maps, c.maps.parameters.model
     likelihood = naive.log_likelihood(maps.readings, maps.grid, maps.ml, model, maps.normals)
     assert maps.log_likelihood == pytest.approx(likelihood, abs=1e-5)
     prior = naive.log_prior(c.prior, maps.ml == 1, maps.grid.shape)
     assert maps.objective == pytest.approx(likelihood + prior, abs=1e-5)
-    # logs are whole numbers of rounded likelihoods
-    searched = naive.log_likelihood(*c.told, model, maps.normals)
+    # logs are integers of rounded likelihoods
+    searched = naive.log_likelihood(*c.inputs, model, maps.normals)
     assert maps.statistics['searched_log_likelihood'] == pytest.approx(searched, abs=1e-4)
     for t in range(len(maps.readings)):
         met = naive.obstacles(maps.readings, t, maps.grid, maps.ml, model, maps.normals)
@@ -118,42 +118,42 @@ def test_the_likelihood_and_the_objective(seed: int) -> None:
 
 
 @pytest.mark.parametrize('seed', SEEDS)
-def test_no_single_flip_gains_where_the_search_ended(seed: int) -> None:
+def test_no_single_flip_gains_at_the_end_of_the_search(seed: int) -> None:
     c = case(seed)
     assert c.maps.statistics['converged']
-    told, occupied = evidence(seed), c.searched.ravel()
+    nats, occupied = evidence(seed), c.searched.ravel()
     assert occupied.sum() > 10
-    for cell in np.flatnonzero(told):
-        data = -told[cell] if occupied[cell] else told[cell]
+    for cell in np.flatnonzero(nats):
+        data = -nats[cell] if occupied[cell] else nats[cell]
         gain = data + naive.prior_gain(c.prior, occupied, cell, c.maps.grid.shape)
         assert gain < LEAST[0] + LEAST[1] * len(c.maps.readings) + 1e-4
 
 
 @pytest.mark.parametrize('seed', SEEDS)
-def test_the_map_that_is_handed_out(seed: int) -> None:
+def test_final_map_is_that_of_the_twin(seed: int) -> None:
     c = case(seed)
     search, model = c.maps.parameters.search, c.maps.parameters.model
     least = search.least_passed, search.least_noticed
-    expected = naive.handed_out(*c.told, model, c.maps.normals, c.traversed, round(EXTENSION / 0.1), least)
+    expected = naive.final_map(*c.inputs, model, c.maps.normals, c.traversed, round(EXTENSION / 0.1), least)
     assert np.array_equal(c.maps.ml, expected)
     assert set(np.unique(expected)) == {-1, 0, 1}
 
 
 @pytest.mark.parametrize('seed', SEEDS)
-def test_the_uncertainty_map(seed: int) -> None:
+def test_uncertainty_map_is_that_of_the_twin(seed: int) -> None:
     c = case(seed)
     search, grid = c.maps.parameters.search, c.maps.grid
-    told, passes = evidence(seed), c.passes
+    nats, passes = evidence(seed), c.passes
     expected = naive.calibrated(
-        told.reshape(grid.shape), passes.sum(axis=0).reshape(grid.shape), c.maps.ml, search.alpha
+        nats.reshape(grid.shape), passes.sum(axis=0).reshape(grid.shape), c.maps.ml, search.alpha
     )
     noticing = naive.noticing(passes, c.maps.parameters.model.p_hit, c.maps.parameters.model.max_incidence_angle)
     for cell, q in enumerate(c.maps.uncertainty.ravel()):
         if np.isnan(q):
             assert c.maps.ml.ravel()[cell] == -1
-            assert abs(told[cell]) < 0.1 + 1e-4 or (told[cell] < 0 and noticing[cell] < 0.1 + 1e-4)
+            assert abs(nats[cell]) < 0.1 + 1e-4 or (nats[cell] < 0 and noticing[cell] < 0.1 + 1e-4)
         elif c.traversed.ravel()[cell]:
-            # where the robot was, a cell cannot be occupied
+            # at the position of the robot, a cell cannot be occupied
             assert q == 0
         else:
             assert q == pytest.approx(expected.ravel()[cell], abs=1e-4)
@@ -169,8 +169,8 @@ def in_room(x: float, y: float, bearing: float, half: float) -> float:
 
 
 @pytest.mark.parametrize('sonars', [1, 3, 8])
-def test_a_robot_that_turns_on_the_spot_knows_the_room_around_it(sonars: int) -> None:
-    # every place is seen from one direction alone
+def test_robot_that_turns_on_the_spot_maps_the_room_as_free(sonars: int) -> None:
+    # each place is seen from one direction only
     x, y, half = 2.5, 2.2, 0.13
     bearings = np.arange(144)[:, None] * (2 * np.pi / 72) + np.arange(sonars) * (2 * np.pi / 8)
     z = [min(in_room(x, y, bearing, half), 4.0) for bearing in bearings.ravel()]

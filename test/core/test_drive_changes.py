@@ -1,4 +1,4 @@
-"""Places that drives contradict: a door that is shut in one of them is told, and nothing else is."""
+"""Changes between drives: a door that is closed in one drive gives a warning, and other differences do not."""
 
 from __future__ import annotations
 
@@ -21,8 +21,8 @@ THROUGH = ((1.5, 1.5), (3.0, 3.45), (9.0, 3.45))
 UP_TO = ((1.5, 1.5), (3.0, 3.45), (5.0, 3.45), (4.0, 3.45), (5.1, 3.45))
 
 
-def shut(world: World) -> World:
-    """The same rooms with their door shut."""
+def with_closed_door(world: World) -> World:
+    """The rooms with their door closed."""
     leaf = np.array([[5.85, 2.9, 5.85, 4.0]])
     return dataclasses.replace(
         world, segments=np.concatenate([world.segments, leaf]), smooth=np.append(world.smooth, False)
@@ -30,14 +30,14 @@ def shut(world: World) -> World:
 
 
 @cache
-def driven(open_door: bool, way: tuple[tuple[float, float], ...], seed: int, ring: bool = False) -> Readings:
-    world = rooms_world() if open_door else shut(rooms_world())
+def driven(open_door: bool, path: tuple[tuple[float, float], ...], seed: int, ring: bool = False) -> Readings:
+    world = rooms_world() if open_door else with_closed_door(rooms_world())
     sonars = sonar_ring() if ring else front_array()
-    return drive(world, np.array(way), 0.1, sonars, NOISY, seed=seed).readings
+    return drive(world, np.array(path), 0.1, sonars, NOISY, seed=seed).readings
 
 
 @pytest.mark.parametrize('order', [1, -1])
-def test_a_door_that_was_shut_in_one_drive_is_told(order: int) -> None:
+def test_door_closed_in_one_drive_gives_a_warning(order: int) -> None:
     drives = [driven(True, THROUGH, 0, True), driven(False, UP_TO, 1, True)][::order]
     maps = Mapper(Parameters()).run(of_drives(drives))
     found = changes(maps, 2)
@@ -50,19 +50,19 @@ def test_a_door_that_was_shut_in_one_drive_is_told(order: int) -> None:
 
 
 @pytest.mark.parametrize('ring', [False, True])
-def test_drives_through_the_same_rooms_contradict_each_other_nowhere(ring: bool) -> None:
+def test_drives_through_the_same_rooms_have_no_changes(ring: bool) -> None:
     for seed in range(4):
         ways = (THROUGH, THROUGH[::-1], UP_TO)
         drives = [driven(True, way, 10 * seed + k, ring) for k, way in enumerate(ways)]
         assert changes(Mapper(Parameters()).run(of_drives(drives)), 3) == []
 
 
-def test_a_person_who_walks_behind_the_robot_is_no_change() -> None:
-    """Smooth walls, lost echoes and a person, but not the same ones."""
+def test_person_behind_the_robot_is_no_change() -> None:
+    """Two drives with smooth walls, lost echoes and a person, each with other noise."""
     maps = Mapper(Parameters()).run(of_drives([corridor_drive(seed).readings for seed in range(2)]))
     assert changes(maps, 2) == []
 
 
-def test_one_drive_contradicts_nobody() -> None:
+def test_single_drive_has_no_changes() -> None:
     maps = Mapper(Parameters()).run(driven(True, THROUGH, 0))
     assert change_warnings(maps, ['monday']) == [] == changes(maps, 1)

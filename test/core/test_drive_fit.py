@@ -1,4 +1,4 @@
-"""Drives that fit the map of all, and one that does not."""
+"""Drives that fit the common map, and one that does not."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def tour(seed: int) -> Readings:
 
 
 def moved(readings: Readings, x: float, y: float, turn: float) -> Readings:
-    """The readings of a robot whose frame lies elsewhere."""
+    """The readings of a robot with its frame at another place."""
     cos, sin = math.cos(turn), math.sin(turn)
     return replace(
         readings,
@@ -41,30 +41,30 @@ def mapped(*drives: Readings) -> MapSet:
     return Mapper(Parameters()).run(of_drives(drives))
 
 
-def test_drives_that_fit() -> None:
+def test_drives_that_fit_give_no_warning() -> None:
     maps = mapped(*(tour(seed) for seed in range(3)))
     assert max(misfits(maps, 3)) < WORSE / 2
     assert fit_warnings(maps, ['a', 'b', 'c']) == []
 
 
 @pytest.mark.parametrize('away', [(0.3, -0.3, 0.0), (0.0, 0.0, 0.1), (2.0, 1.0, 0.0)])
-def test_the_odd_one_is_named(away: tuple[float, float, float]) -> None:
+def test_warning_names_the_drive_that_does_not_fit(away: tuple[float, float, float]) -> None:
     maps = mapped(tour(0), moved(tour(1), *away), tour(2))
-    (told,) = fit_warnings(maps, ['monday', 'tuesday', 'sunday'])
-    assert told.startswith('tuesday (') and 'monday' not in told and 'does not fit' in told
+    (warning,) = fit_warnings(maps, ['monday', 'tuesday', 'sunday'])
+    assert warning.startswith('tuesday (') and 'monday' not in warning and 'does not fit' in warning
 
 
-def test_of_two_both_are_named() -> None:
-    (told,) = fit_warnings(mapped(tour(0), moved(tour(1), 0.4, 0.3, 0.0)), ['monday', 'tuesday'])
-    assert 'monday' in told and 'tuesday' in told and 'do not fit each other' in told
+def test_warning_names_both_of_two_drives() -> None:
+    (warning,) = fit_warnings(mapped(tour(0), moved(tour(1), 0.4, 0.3, 0.0)), ['monday', 'tuesday'])
+    assert 'monday' in warning and 'tuesday' in warning and 'do not fit each other' in warning
 
 
-def test_a_drive_alone_and_a_short_one_are_not_judged() -> None:
+def test_single_and_short_drives_are_not_judged() -> None:
     assert fit_warnings(mapped(tour(0)), ['monday']) == []
     assert misfits(mapped(tour(0), moved(tour(1), 0.4, 0.3, 0.0).select(slice(0, 200))), 2)[1] == 0.0
 
 
-def test_readings_of_drives_are_put_together_and_parted() -> None:
+def test_readings_of_drives_are_joined_and_split() -> None:
     names = ('b', 'a')
     one = Readings.from_columns(
         names, x=[1.0, 2.0], y=0.0, yaw=0.0, z=[1.0, 1.0], z_max=2.0, half_angle=0.1, sensor=[0, 1]
@@ -83,7 +83,7 @@ def test_readings_of_drives_are_put_together_and_parted() -> None:
     assert drives_of(one)[0] is one
 
 
-def test_canonical_order_does_not_depend_on_that_of_the_drives() -> None:
+def test_canonical_order_does_not_depend_on_the_order_of_drives() -> None:
     drives = [tour(seed) for seed in range(3)]
     found = [in_canonical_order(of_drives([drives[k] for k in order])) for order in ((0, 1, 2), (2, 0, 1), (1, 2, 0))]
     for other in found[1:]:

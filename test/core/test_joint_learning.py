@@ -1,4 +1,4 @@
-"""Learning together with the map: what it finds, how it is biased, and that it tells when walls get lost."""
+"""Learning of parameters and map together: results, bias, and warnings about lost walls."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ def walls_of(learned: Learned) -> list[str]:
 
 
 @pytest.mark.parametrize('seed', [0, 1])
-def test_values_that_lose_the_smooth_wall_are_refused(seed: int) -> None:
+def test_values_that_lose_the_smooth_wall_are_rejected(seed: int) -> None:
     recording = corridor(seed)
     learned = learn_jointly(recording.readings, Parameters().varied(PLAIN))
     last = learned.rounds[-1]
@@ -50,7 +50,7 @@ def test_values_that_lose_the_smooth_wall_are_refused(seed: int) -> None:
     assert 'p_hit rose' in warning and 'refused' in warning and 'smooth walls' in warning
     assert learned.accepted == len(learned.rounds) - 2
     assert last.lost_length > 5 and last.unexplained > learned.rounds[0].unexplained
-    # what was given up is the smooth wall, but for a ghost of it
+    # only the smooth wall was lost, and a mirror image of it
     row = np.flatnonzero(recording.world.smooth_cells.any(1))[0]
     smooth = [stretch for stretch in last.lost if abs(stretch.start[1] - (row + 0.5) * 0.1) < 0.25]
     assert last.lost[0] in smooth and sum(stretch.length for stretch in smooth) > 0.9 * last.lost_length
@@ -59,7 +59,7 @@ def test_values_that_lose_the_smooth_wall_are_refused(seed: int) -> None:
     assert bool(learned.estimates) == (learned.accepted > 0)
 
 
-def test_they_are_handed_out_on_request() -> None:
+def test_rejected_values_are_returned_with_keep_going() -> None:
     learned = learn_jointly(corridor(1).readings, Parameters().varied(PLAIN), 2, keep_going=True)
     assert learned.accepted == 2
     assert learned.parameters.model == learned.rounds[2].model
@@ -67,7 +67,7 @@ def test_they_are_handed_out_on_request() -> None:
     assert smooth_recall(learned.maps, corridor(1)) < 0.5
 
 
-def test_without_smooth_walls_nothing_is_refused_and_the_map_fits_too_well() -> None:
+def test_without_smooth_walls_values_are_accepted_with_bias() -> None:
     recording = door_drive(3, NoiseModel(sigma=0.07, p_random=0.08, p_lost=0.1), 0)
     readings = recording.readings
     learned = learn_jointly(readings, Parameters().varied(PLAIN), 10)
@@ -78,20 +78,20 @@ def test_without_smooth_walls_nothing_is_refused_and_the_map_fits_too_well() -> 
     sure = estimates(ForwardModel(readings, world.grid, known), world.reference)
     for name, truth in (('p_rand', 0.08), ('p_lost', 0.1)):
         assert sure[name].low < truth < sure[name].high
-    # with cells of 10 cm, distances to their centres are a little off
+    # with cells of 10 cm, distances to their centres have small errors
     assert known.sigma == pytest.approx(0.07, abs=0.01)
-    # the map that was made from the readings explains by walls what was chance and noise
+    # the map was made from the readings, so it explains random readings and noise by walls
     for name in ('p_rand', 'sigma'):
         assert getattr(model, name) < getattr(known, name) - 2 * learned.estimates[name].error
     assert known.p_rand / 3 < model.p_rand and model.p_lost == pytest.approx(0.1, abs=0.05)
     assert learned.rounds[-1].log_likelihood > learned.rounds[0].log_likelihood
 
 
-def test_a_search_that_ends_in_another_basin_is_called_so(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_search_that_ends_in_another_optimum_gives_a_warning(monkeypatch: pytest.MonkeyPatch) -> None:
     runs = []
 
     class SecondEndsPoorly(Mapper):
-        """In its second search walls cost so much that it ends in a map with few of them."""
+        """Its second search has a high cost of walls, so it ends in a map with few of them."""
 
         def __init__(self, parameters: Parameters) -> None:
             runs.append(parameters)
@@ -108,7 +108,7 @@ def test_a_search_that_ends_in_another_basin_is_called_so(monkeypatch: pytest.Mo
     assert drop > LIKELIHOOD_DROP * len(readings)
     (warning,) = (warning for warning in learned.warnings if 'another local maximum' in warning)
     assert 'round 1' in warning and f'{drop:.0f} nats' in warning
-    # of both maps the likelihood is that of the forward model with the values and the normals of the new one
+    # the likelihood of both maps is that of the forward model with the new values and normals
     forward = learned.maps.forward_model()
     assert last.log_likelihood == pytest.approx(forward.log_likelihood(learned.maps.ml), abs=1e-6)
     first = Mapper(Parameters()).run(readings)
@@ -116,22 +116,22 @@ def test_a_search_that_ends_in_another_basin_is_called_so(monkeypatch: pytest.Mo
     assert last.log_likelihood_before == pytest.approx(before, abs=1e-6)
 
 
-def test_weak_values_are_called_so() -> None:
+def test_uncertain_values_give_a_warning() -> None:
     readings = random_readings(np.random.default_rng(0), Grid(0.1, 0, 0, 30, 30), 150)
     readings.half_angle[:] = 0.1
     learned = learn_jointly(readings, Parameters().varied(PLAIN), 2, keep_going=True)
-    told = ' '.join(learned.warnings)
-    assert 'inform p_hit; it is only a rough estimate' in told
+    warnings = ' '.join(learned.warnings)
+    assert 'inform p_hit; it is only a rough estimate' in warnings
     assert 'had not converged' in learn_jointly(readings, Parameters().varied(PLAIN), 1, keep_going=True).warnings[0]
 
 
-def test_much_chance_is_called_so() -> None:
+def test_many_random_readings_give_a_warning() -> None:
     recording = door_drive(3, NoiseModel(sigma=0.05, p_random=0.6), 0)
     learned = learn_jointly(recording.readings, Parameters().varied({**PLAIN, 'prior': 0.05}), 3)
     assert any('more than the random measurements of a working sonar' in warning for warning in learned.warnings)
 
 
-def test_no_readings() -> None:
+def test_learning_without_readings_raises() -> None:
     with pytest.raises(InputError):
         learn_jointly(
             Readings.from_columns(z=[], x=[], y=[], yaw=[], z_max=[], half_angle=[]), Parameters().varied(PLAIN)
@@ -139,7 +139,7 @@ def test_no_readings() -> None:
 
 
 def facing_wall() -> MapSet:
-    """A wall of three metres at y = 1, heard from below."""
+    """A wall of three metres at y = 1, seen from below."""
     x = np.repeat(np.arange(0.05, 3.0, 0.1), 4)
     grid = Grid(0.1, -2, -2, 40, 20)
     ml = np.zeros(grid.shape, np.int8)
@@ -152,12 +152,12 @@ def facing_wall() -> MapSet:
     return MapSet(grid, nothing, ml, nothing, readings, unexplained, 0.0, 0.0, Parameters().varied(PLAIN))
 
 
-def test_lost_walls() -> None:
+def test_lost_walls_are_found() -> None:
     before = facing_wall()
     assert lost_walls(before, before) == []
     gone = before.ml.copy()
     gone[12, 12:22] = 0
-    # a cell aside is not lost, and so neither are the ends beside what is left
+    # a wall moved by a cell is not lost, nor are ends next to remaining cells
     moved = np.roll(before.ml, 1, axis=0)
     assert lost_walls(before, dataclasses.replace(before, ml=moved)) == []
     (stretch,) = lost_walls(before, dataclasses.replace(before, ml=gone))
@@ -169,7 +169,7 @@ def test_lost_walls() -> None:
     assert lost_walls(before, dataclasses.replace(before, ml=gone)) == [], 'too short to matter'
 
 
-def test_what_was_driven_over_is_no_wall() -> None:
+def test_traversed_cells_are_no_lost_walls() -> None:
     before = facing_wall()
     path = dataclasses.replace(before.readings, y=np.full(len(before.readings), 1.25), z=np.full(120, 3.0))
     both = Readings.from_columns(

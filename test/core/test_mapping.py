@@ -1,4 +1,4 @@
-"""The whole run: laws that the three maps obey together."""
+"""The whole run: properties of the three maps."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ def test_maps_do_not_depend_on_the_order_of_arrival() -> None:
     assert same(run(readings), run(shuffled))
 
 
-def test_sensor_numbers_do_not_matter() -> None:
+def test_maps_do_not_depend_on_sensor_numbers() -> None:
     readings = some()
     half = (np.arange(len(readings)) % 2).astype(np.int32)
     stamps = np.arange(len(readings)) // 8
@@ -69,13 +69,13 @@ def turned(readings: Readings) -> Readings:
 
 
 @pytest.mark.parametrize('values', [PLAIN, {}], ids=['paper', 'defaults'])
-# the same examples each time: in one of some hundred, two moves of the search gain the same in whole numbers
+# fixed examples: in about one of a hundred, two moves of the search have exactly the same gain
 @settings(max_examples=12, deadline=None, derandomize=True)
 @given(seed=st.integers(0, 2**31 - 1), count=st.integers(1, 500))
-def test_mirrored_or_turned_readings_give_the_mirrored_or_turned_maps(
+def test_turned_or_mirrored_readings_give_turned_or_mirrored_maps(
     values: dict[str, float], seed: int, count: int
 ) -> None:
-    # readings from places of no pattern: of flips that gain exactly the same, the first in the order of cells is taken
+    # readings from irregular places: of flips with exactly the same gain, the first in the order of cells is taken
     readings = some(seed, count)
     plain, mirror, turn = (run(r, **values) for r in (readings, mirrored(readings), turned(readings)))
     for name, tolerance in (('ml', 0), ('live', 1e-5), ('uncertainty', 1e-4)):
@@ -85,20 +85,20 @@ def test_mirrored_or_turned_readings_give_the_mirrored_or_turned_maps(
 
 
 @pytest.mark.parametrize('seed', range(4))
-def test_with_nearest_points_the_same_holds_but_for_ties(seed: int) -> None:
-    # two neighbours can be equally near, and then the first in the order of cells is taken
+def test_mirrored_readings_with_plain_model_differ_only_by_ties(seed: int) -> None:
+    # two neighbours may be equally near, and then the first in the order of cells is taken
     plain, mirror = (run(r, **PLAIN) for r in (some(seed), mirrored(some(seed))))
     assert (mirror.ml[:, ::-1] != plain.ml).sum() <= 4
     assert mirror.objective == pytest.approx(plain.objective, abs=2.0)
 
 
-def test_all_maps_know_the_same_grid_and_the_figures_fit_the_map() -> None:
+def test_maps_share_a_grid_and_match_likelihood_and_objective() -> None:
     maps = run(some(), **PLAIN)
     assert maps.live.shape == maps.ml.shape == maps.uncertainty.shape == maps.grid.shape
     assert np.array_equal(np.isnan(maps.uncertainty), maps.ml == -1)
     assert set(np.unique(maps.ml)) == {-1, 0, 1}
     likelihood = log_likelihood(maps.readings, maps.grid, maps.ml, maps.parameters.model)
-    # logs are whole numbers of rounded likelihoods
+    # logs are integers of rounded likelihoods
     error = ROUNDING * len(maps.readings)
     assert maps.log_likelihood == pytest.approx(likelihood, abs=error)
     prior = maps.parameters.search.prior
@@ -109,19 +109,19 @@ def test_all_maps_know_the_same_grid_and_the_figures_fit_the_map() -> None:
 
 
 @pytest.mark.parametrize('values', [{}, {'least_passed': 1.5}, {'wall_cost': 3.0, 'likelihood_exponent': 1.0}])
-def test_with_all_that_makes_maps_better_they_still_know_the_same_grid(values: dict[str, float]) -> None:
+def test_maps_share_a_grid_with_default_parameters(values: dict[str, float]) -> None:
     maps, plain = run(some(), **values), run(some(), **PLAIN)
     assert maps.live.shape == maps.ml.shape == maps.uncertainty.shape == maps.grid.shape
-    said = ~np.isnan(maps.uncertainty)
+    determined = ~np.isnan(maps.uncertainty)
     traversed = traversed_cells(maps.readings, maps.grid)
-    assert not (said & (plain.ml == -1) & ~traversed).any(), 'what nobody saw is unknown'
-    assert not (maps.ml[~said] != -1).any(), 'and so is what the readings say nothing about'
-    assert (maps.ml[said] == -1).any(), 'of what was seen, but not gone through, they may say something'
-    assert ((plain.ml != -1) & ~said).any()
+    assert not (determined & (plain.ml == -1) & ~traversed).any(), 'what nobody saw is unknown'
+    assert not (maps.ml[~determined] != -1).any(), 'and so is what the readings say nothing about'
+    assert (maps.ml[determined] == -1).any(), 'of what was seen, but not gone through, they may say something'
+    assert ((plain.ml != -1) & ~determined).any()
 
 
-def test_where_the_robot_stands_is_free_before_it_moves() -> None:
-    # a ring of 16 sonars around a hole that none of them sees, three sweeps in a square room
+def test_cells_below_the_robot_are_free_at_standstill() -> None:
+    # a ring of 16 sonars around a hole that they do not see; three sweeps in a square room
     yaw = np.tile(np.arange(16) * math.pi / 8, 3)
     wall = 1.5 / np.maximum(np.abs(np.cos(yaw)), np.abs(np.sin(yaw)))
     readings = Readings.from_columns(
@@ -141,10 +141,10 @@ def test_where_the_robot_stands_is_free_before_it_moves() -> None:
 
 
 @pytest.mark.parametrize('exponent', [0.7, 1.0])
-def test_the_objective_is_the_tempered_likelihood_and_the_prior_of_the_map_that_was_found(
+def test_objective_is_tempered_likelihood_and_prior_of_the_found_map(
     exponent: float, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    # as it is before walls are extended and free told from unknown; the likelihood is that of whole cones
+    # the map before walls are extended and unknown cells are determined; the likelihood is that of whole cones
     monkeypatch.setattr(handed_out, 'EXTENSION', 0.0)
     whole = {**PLAIN_MODEL, 'least_passed': 0.0, 'likelihood_exponent': exponent}
     maps = run(some(), **whole)
@@ -152,13 +152,13 @@ def test_the_objective_is_the_tempered_likelihood_and_the_prior_of_the_map_that_
     assert maps.log_likelihood == pytest.approx(likelihood, abs=ROUNDING * len(maps.readings))
     traversed = traversed_cells(maps.readings, maps.grid)
     prior = wall_prior(maps.parameters.search, traversed.ravel(), maps.grid.resolution)
-    told = naive.log_prior(prior, maps.ml == 1, maps.grid.shape)
-    assert maps.objective - exponent * maps.log_likelihood == pytest.approx(told, abs=1e-9)
+    actual = naive.log_prior(prior, maps.ml == 1, maps.grid.shape)
+    assert maps.objective - exponent * maps.log_likelihood == pytest.approx(actual, abs=1e-9)
     assert (maps.ml == 1).any()
     assert not (maps.ml == 1)[traversed].any()
 
 
-def test_a_start_with_occupied_cells_where_the_robot_was_is_corrected() -> None:
+def test_occupied_traversed_cells_of_the_start_map_are_freed() -> None:
     maps = run(some(), **PLAIN)
     wrong = maps.ml.copy()
     wrong[traversed_cells(maps.readings, maps.grid)] = 1
@@ -175,61 +175,61 @@ def along_a_corridor() -> MapSet:
     return maps
 
 
-def test_the_likelihood_is_that_of_the_map_handed_out_by_the_definition() -> None:
+def test_likelihood_is_that_of_the_final_map_by_definition() -> None:
     maps = along_a_corridor()
     some_of_them = np.arange(0, len(maps.readings), 61)
     readings = maps.readings.select(some_of_them)
-    told = maps.forward_model().expectations(maps.ml).log_likelihood
-    assert maps.log_likelihood == pytest.approx(told.sum(), abs=1e-6)
+    actual = maps.forward_model().expectations(maps.ml).log_likelihood
+    assert maps.log_likelihood == pytest.approx(actual.sum(), abs=1e-6)
     left_out = 0
     for k, t in enumerate(some_of_them):
         met = naive.obstacles(readings, k, maps.grid, maps.ml, maps.parameters.model, maps.normals)
         sigma = naive.sigma_of(readings, k, maps.grid, maps.parameters.model)
         exact = naive.likelihood(readings.z[k], readings.z_max[k], sigma, met, maps.parameters.model)
-        assert told[t] == pytest.approx(math.log(exact), abs=1e-9)
+        assert actual[t] == pytest.approx(math.log(exact), abs=1e-9)
         left_out += len(naive.obstacles(readings, k, maps.grid, maps.ml, maps.parameters.model)) - len(met)
     assert left_out > 0, 'no reading exceeds the incidence angle'
 
 
-def test_the_search_has_the_same_likelihood_of_the_map_that_it_found() -> None:
+def test_search_has_the_same_likelihood_as_the_forward_model() -> None:
     maps = along_a_corridor()
     mapper, seen = Mapper(maps.parameters), []
     mapper.run(maps.readings, lambda stage, progress: seen.append(mapper.so_far()) if progress else None)
     _, searched = seen[-1]
     assert ((maps.ml == 1) & (searched != 1)).any(), 'walls were extended'
     error = ROUNDING * len(maps.readings)
-    told = maps.statistics['searched_log_likelihood']
-    assert told == pytest.approx(maps.forward_model().log_likelihood(searched), abs=error)
-    assert told != pytest.approx(maps.log_likelihood, abs=error)
+    actual = maps.statistics['searched_log_likelihood']
+    assert actual == pytest.approx(maps.forward_model().log_likelihood(searched), abs=error)
+    assert actual != pytest.approx(maps.log_likelihood, abs=error)
     traversed = traversed_cells(maps.readings, maps.grid).ravel()
     prior = wall_prior(maps.parameters.search, traversed, maps.grid.resolution)
     for ml, objective, likelihood in (
         (maps.ml, maps.objective, maps.log_likelihood),
-        (searched, maps.statistics['searched_objective'], told),
+        (searched, maps.statistics['searched_objective'], actual),
     ):
         assert objective - likelihood == pytest.approx(naive.log_prior(prior, ml == 1, maps.grid.shape), abs=1e-6)
 
 
 @pytest.mark.parametrize('seed', [0, 1, 2, None], ids=['0', '1', '2', 'along a corridor'])
-def test_unexplained_readings_are_those_that_are_random_rather_than_anything_else(seed: int | None) -> None:
-    # made here, since every process that collects tests would make what stands in the list of parameters
+def test_unexplained_readings_are_most_likely_random(seed: int | None) -> None:
+    # computed here: in the list of parameters, each process that collects tests would compute it
     maps = along_a_corridor() if seed is None else run(some(seed), **PLAIN)
     random = maps.forward_model().expectations(maps.ml).random
     assert np.array_equal(maps.unexplained, random > 0.5)
     assert 0 < maps.unexplained.sum() < len(maps.readings)
 
 
-def test_beside_a_larger_live_map_the_likelihood_stays_the_same() -> None:
+def test_likelihood_is_the_same_with_a_larger_live_map() -> None:
     maps = along_a_corridor()
     g = maps.grid
     larger = Grid(g.resolution, g.column - 7, g.row - 2, g.width + 10, g.height + 11)
     beside = maps.with_live(larger, np.full(larger.shape, np.nan, np.float32))
     assert beside.grid == larger
-    # sums of distances to places that are numbered otherwise
+    # sums of distances to places with other numbers
     assert beside.forward_model().log_likelihood(beside.ml) == pytest.approx(maps.log_likelihood, abs=1e-6)
 
 
-def test_the_map_so_far_is_known_while_the_search_runs() -> None:
+def test_intermediate_map_is_available_during_the_search() -> None:
     mapper, seen = Mapper(Parameters().varied(PLAIN)), []
     assert mapper.so_far() is None
     maps = mapper.run(some(), lambda stage, progress: seen.append(mapper.so_far()) if progress else None)
@@ -241,12 +241,12 @@ def test_the_map_so_far_is_known_while_the_search_runs() -> None:
     assert not any(ml is maps.ml for _, ml in seen), 'a copy'
 
 
-def test_no_readings_is_an_error_that_says_so() -> None:
+def test_run_without_readings_raises() -> None:
     with pytest.raises(InputError, match='no reading'):
         run(some(count=0))
 
 
-def test_a_run_can_be_cancelled_at_any_stage() -> None:
+def test_run_can_be_cancelled_at_any_stage() -> None:
     for stage in ('index', 'search', 'standard map', 'post-processing', 'uncertainty'):
         mapper = Mapper(Parameters())
         with pytest.raises(Cancelled):
@@ -255,7 +255,7 @@ def test_a_run_can_be_cancelled_at_any_stage() -> None:
             )
 
 
-def test_one_reading() -> None:
+def test_run_with_one_reading() -> None:
     maps = run(some(count=1))
     assert maps.statistics['converged']
     assert len(maps.unexplained) == 1

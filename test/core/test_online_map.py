@@ -1,4 +1,4 @@
-"""The map that follows the readings: nearly that of a batch, and no larger for readings that say the same."""
+"""The online map: about as good as a batch, and of constant memory for repeated readings."""
 
 from __future__ import annotations
 
@@ -52,21 +52,21 @@ def some(seed: int = 0, count: int = 150) -> Readings:
 
 
 def consistent(online: OnlineMap) -> bool:
-    """Whether all that is kept is as if built from the map at hand."""
+    """Whether the whole state equals one built from the current map."""
     evidence = online._evidence
     maps = evidence.state.maps
-    told = [maps.evidence.copy(), maps.pattern.copy()]
+    stored = [maps.evidence.copy(), maps.pattern.copy()]
     likelihood = evidence.log_likelihood
     evidence.rebuild()
     return (
-        np.array_equal(told[0], maps.evidence)
-        and np.array_equal(told[1], patterns(maps.occupied, evidence.grid.shape))
+        np.array_equal(stored[0], maps.evidence)
+        and np.array_equal(stored[1], patterns(maps.occupied, evidence.grid.shape))
         and likelihood == evidence.log_likelihood
     )
 
 
 @pytest.mark.parametrize('drive', ['door', 'corridor'])
-def test_readings_in_sweeps_give_nearly_the_map_of_a_batch(drive: str) -> None:
+def test_readings_in_sweeps_give_about_the_map_of_a_batch(drive: str) -> None:
     recording = door_drive(3, NOISY) if drive == 'door' else corridor_drive()
     readings = recording.readings
     parameters = Parameters()
@@ -80,16 +80,16 @@ def test_readings_in_sweeps_give_nearly_the_map_of_a_batch(drive: str) -> None:
     assert consistent(online)
 
 
-def test_the_grid_is_that_of_a_batch() -> None:
+def test_grid_is_that_of_a_batch() -> None:
     maps = Mapper(Parameters()).run(some())
     assert in_sweeps(some(), Parameters()).grid == maps.grid
 
 
-def test_a_grid_that_grows_in_the_middle_loses_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_growing_grid_keeps_the_state(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(online_map, 'REFINE_LEAST', math.inf)
     near = some()
     away = dataclasses.replace(near, x=near.x + 25.0, y=near.y - 18.0, stamp=near.stamp + 10**12)
-    # few readings, which say enough for walls
+    # a few readings that are sufficient for walls
     online = in_sweeps(near, Parameters().varied({'p_rand': 0.3, 'p_lost': 0.4}))
     grid, before = online.maps()[:2]
     room = online._evidence.grid
@@ -109,11 +109,11 @@ def test_a_grid_that_grows_in_the_middle_loses_nothing(monkeypatch: pytest.Monke
 
 
 @pytest.mark.parametrize('values', [PLAIN, {}], ids=['plain', 'whole'])
-def test_readings_that_say_the_same_add_weight_and_nothing_else(values: dict[str, float]) -> None:
+def test_repeated_readings_only_add_weight(values: dict[str, float]) -> None:
     readings = some()
     online = in_sweeps(readings, Parameters().varied(values), 150)
     count = len(online)
-    # what is said again and again settles what is known of surfaces, and pairs are made anew where that changes
+    # after some repetitions normals no longer change, and pairs are computed again where they change
     for _ in range(4):
         online.add(readings)
     taken = online._evidence.nbytes
@@ -124,7 +124,7 @@ def test_readings_that_say_the_same_add_weight_and_nothing_else(values: dict[str
     evidence = online._evidence
     weight = evidence.state.reading_states['multiplicity'][:count]
     assert weight.sum() == 8 * len(readings)
-    # as if each kept reading had come so many times
+    # as if each kept reading had come this number of times
     often = Evidence(evidence.grid, evidence.model, start=evidence.state.maps.occupied.reshape(evidence.grid.shape))
     kept = np.array(sorted(set(online._kept.values())))
     assert kept.tolist() == list(range(count))
@@ -139,7 +139,7 @@ def test_readings_that_say_the_same_add_weight_and_nothing_else(values: dict[str
 
 
 def keys_of(online: OnlineMap, readings: Readings) -> list[bytes]:
-    """The keys under which the readings are counted, one by one."""
+    """The keys under which the readings are counted, one for each."""
     out = []
     for i in range(len(readings)):
         fresh = OnlineMap(online._parameters)
@@ -162,8 +162,8 @@ def keys_of(online: OnlineMap, readings: Readings) -> list[bytes]:
     ],
     ids=str,
 )
-def test_what_says_the_same_is_near_in_every_way(change: dict[str, float], same: bool) -> None:
-    # in the middle of the steps that are taken for the same
+def test_only_readings_near_in_all_values_are_merged(change: dict[str, float], same: bool) -> None:
+    # in the middle of the steps within which readings are merged
     at: dict[str, object] = {'x': 1.02, 'y': 1.02, 'yaw': 0.02, 'z': 1.02, 'z_max': 3.0, 'half_angle': 0.2, 'stamp': 0}
     online = OnlineMap(Parameters())
     for values in (at, at | {name: at[name] + step for name, step in change.items()}):
@@ -172,9 +172,7 @@ def test_what_says_the_same_is_near_in_every_way(change: dict[str, float], same:
 
 
 @pytest.mark.parametrize('portion', [1, 7, 1000])
-def test_readings_are_numbered_the_same_whatever_is_looked_up_at_once(
-    monkeypatch: pytest.MonkeyPatch, portion: int
-) -> None:
+def test_numbers_of_readings_do_not_depend_on_portions(monkeypatch: pytest.MonkeyPatch, portion: int) -> None:
     readings = some(3, 60).select(np.r_[0:40, 20:60, 0:60])
     expected = OnlineMap(Parameters())
     expected.add(readings)
@@ -186,19 +184,19 @@ def test_readings_are_numbered_the_same_whatever_is_looked_up_at_once(
     for key in keys_of(online, readings):
         numbers.setdefault(key, len(numbers))
     assert dict(online._kept) == dict(expected._kept) == numbers
-    assert kept_of(online).same(kept_of(expected))
+    assert state_of(online).same(state_of(expected))
     online.dismantle()
     assert len(online._kept) == 0 == len(list(online._kept))
 
 
-def test_no_sign_of_zero_makes_two_of_the_same() -> None:
+def test_keys_ignore_the_sign_of_zero() -> None:
     reading = dataclasses.replace(some(count=1), x=np.zeros(1), y=np.zeros(1), yaw=np.zeros(1))
     below = dataclasses.replace(reading, x=-reading.x, y=-reading.y, yaw=-reading.yaw)
     (one,), (other,) = (OnlineMap(Parameters())._keys(each) for each in (reading, below))
     assert one == other
 
 
-def test_another_sensor_says_something_else() -> None:
+def test_readings_of_different_sensors_are_not_merged() -> None:
     reading = some(count=1)
     online = OnlineMap(Parameters())
     online.add(reading)
@@ -206,7 +204,7 @@ def test_another_sensor_says_something_else() -> None:
     assert len(online) == 2
 
 
-def test_a_map_can_be_adopted() -> None:
+def test_map_can_be_adopted() -> None:
     readings, parameters = some(), Parameters()
     maps = Mapper(parameters).run(readings)
     online = in_sweeps(readings, parameters)
@@ -219,14 +217,14 @@ def test_a_map_can_be_adopted() -> None:
     assert grid == maps.grid
     assert (ml[maps.ml == 1] == 1).all()
     assert consistent(online)
-    # only a part: the rest is free
+    # only a part: the other cells are free
     corner = Grid(grid.resolution, grid.column, grid.row, 5, 4)
     online.adopt(corner, np.ones(corner.shape, np.int8))
     assert online._evidence.state.maps.occupied.sum() == 20
     assert consistent(online)
 
 
-def test_before_the_first_reading_there_is_nothing() -> None:
+def test_map_before_the_first_reading_is_empty() -> None:
     online = OnlineMap(Parameters())
     online.adopt(AREA, np.ones(AREA.shape, np.int8))
     online.add(some(count=0))
@@ -240,7 +238,7 @@ def same(a: OnlineMap, b: OnlineMap) -> bool:
     )
 
 
-def test_cleared_it_is_as_new_and_empty_adds_change_nothing() -> None:
+def test_cleared_map_equals_a_new_one_and_empty_adds_have_no_effect() -> None:
     online, fresh = in_sweeps(some(1), Parameters()), in_sweeps(some(2), Parameters())
     online.clear()
     assert (len(online), online.grid.size) == (0, 0)
@@ -251,7 +249,7 @@ def test_cleared_it_is_as_new_and_empty_adds_change_nothing() -> None:
 
 
 @pytest.mark.parametrize('turned', [False, True])
-def test_a_corridor_has_room_along_it_and_within_max_cells(turned: bool) -> None:
+def test_grid_of_a_corridor_has_margins_within_max_cells(turned: bool) -> None:
     way = np.arange(0.0, 60.0, 0.5)
     x, y = (way * 0.0, way) if turned else (way, way * 0.0)
     readings = Readings.from_columns(
@@ -267,15 +265,15 @@ def test_a_corridor_has_room_along_it_and_within_max_cells(turned: bool) -> None
     assert bounded._evidence.grid.size <= most
 
 
-def test_many_readings_at_once_are_not_kept_a_second_time() -> None:
+def test_many_readings_at_once_are_not_stored_twice() -> None:
     online = OnlineMap(Parameters())
     online.add(some(count=3000))
     assert len(online._begun) == online_map.OF_THE_ROBOT
     assert online._begun.x.base is None
 
 
-def test_no_obstacle_stands_inside_a_large_robot() -> None:
-    # two sensors 3 m apart, on either side of a car
+def test_cells_below_a_large_robot_are_free() -> None:
+    # two sensors 3 m apart, on both sides of a car
     way = np.repeat(np.arange(0.0, 12.0, 0.1), 2)
     left = np.tile([0, 1], len(way) // 2)
     side = 2.0 * left - 1.0
@@ -295,7 +293,7 @@ def test_no_obstacle_stands_inside_a_large_robot() -> None:
     assert (whole.ml[whole.grid.cells_of(*across)] == 0).all()
 
 
-def test_without_memory_to_pack_pairs_it_goes_on(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_map_continues_without_memory_to_pack_pairs(monkeypatch: pytest.MonkeyPatch) -> None:
     recording = door_drive(3, NOISY, 0)
     whole = in_sweeps(recording.readings, Parameters())
     tried = []
@@ -313,14 +311,14 @@ def test_without_memory_to_pack_pairs_it_goes_on(monkeypatch: pytest.MonkeyPatch
     assert tried and same(short, whole)
 
 
-def test_a_jump_is_not_driven_over() -> None:
+def test_jump_is_not_traversed() -> None:
     readings = some(count=2)
     readings.x[:], readings.y[:], readings.stamp[:] = [0.0, 12.0], [1.0, 1.0], [0, 10**8]
     online = OnlineMap(Parameters())
     for k in range(2):
         online.add(readings.select(slice(k, k + 1)))
     assert online._traversed.sum() == 2
-    # the second drives on
+    # the second robot drives on
     near = dataclasses.replace(readings.select(slice(1, 2)), x=np.array([12.5]), stamp=np.array([2 * 10**8]))
     online.add(near)
     assert online._traversed.sum() == 7
@@ -328,7 +326,7 @@ def test_a_jump_is_not_driven_over() -> None:
     assert np.array_equal(local < local.max(), online._traversed)
 
 
-def test_a_reading_too_far_away_is_refused_and_changes_nothing() -> None:
+def test_reading_too_far_away_is_rejected_and_changes_nothing() -> None:
     online = in_sweeps(some(), Parameters().varied({'max_cells': 100_000}))
     count, before = len(online), [array.copy() for array in online.maps()[1:]]
     far = dataclasses.replace(some(count=1), x=np.array([1e5]))
@@ -339,7 +337,7 @@ def test_a_reading_too_far_away_is_refused_and_changes_nothing() -> None:
         assert np.array_equal(old, new, equal_nan=True)
 
 
-def test_many_readings_at_once_are_searched_like_a_batch(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_many_readings_at_once_give_the_map_of_a_batch(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(online_map, 'MANY', 100)
     values = {**PLAIN, 'resolution': 0.1}
     readings = some(count=140)
@@ -353,7 +351,7 @@ def test_many_readings_at_once_are_searched_like_a_batch(monkeypatch: pytest.Mon
     np.testing.assert_allclose(uncertainty, maps.uncertainty, atol=1e-5)
 
 
-def test_it_is_searched_anew_from_time_to_time(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_map_is_searched_again_at_intervals(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(online_map, 'REFINE_EVERY', 50)
     often = in_sweeps(some(), Parameters())
     assert often._count == 150 - 2 * 72
@@ -366,7 +364,7 @@ def test_it_is_searched_anew_from_time_to_time(monkeypatch: pytest.MonkeyPatch) 
     assert heights[0] != heights[1]
 
 
-def test_readings_that_say_the_same_may_come_in_one_call() -> None:
+def test_repeated_readings_in_one_call_are_merged() -> None:
     readings = door_drive(1, NOISY, seed=0).readings.select(slice(0, 48))
     twice = readings.select(np.repeat(np.arange(len(readings)), 2))
     together, apart = OnlineMap(Parameters()), OnlineMap(Parameters())
@@ -388,19 +386,19 @@ def fed(parts: list[Readings], values: dict[str, float]) -> OnlineMap:
     return online
 
 
-class Kept(NamedTuple):
-    """Everything that is kept for readings and cells, cell by cell of the map's grid."""
+class State(NamedTuple):
+    """The whole state of readings and cells, by cell of the grid of the map."""
 
     arrays: list[np.ndarray]
     readings: object
     counts: tuple[int, int]
 
-    def same(self, other: Kept) -> bool:
+    def same(self, other: State) -> bool:
         equal = all(np.array_equal(*pair) for pair in zip(self.arrays, other.arrays, strict=True))
         return equal and self.readings == other.readings and self.counts == other.counts
 
 
-def kept_of(online: OnlineMap) -> Kept:
+def state_of(online: OnlineMap) -> State:
     evidence = online._evidence
     s, n = evidence.state, len(online)
     window = evidence.grid.window(online.grid)
@@ -408,32 +406,32 @@ def kept_of(online: OnlineMap) -> Kept:
     arrays += [s.reading_states[name][:n].copy() for name in ('multiplicity', 'occupy', 'release', 'likelihood')]
     if len(s.normals.known):
         arrays.append(s.normals.known.reshape(evidence.grid.shape)[window].copy())
-    return Kept([*arrays, online._traversed[window].copy()], dict(online._kept), (online.taken, online._count))
+    return State([*arrays, online._traversed[window].copy()], dict(online._kept), (online.taken, online._count))
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize('case', ['first', 'more', 'grown', 'refined', 'many'])
-def test_a_call_that_finds_no_memory_takes_nothing_or_all(monkeypatch: pytest.MonkeyPatch, case: str) -> None:
+def test_call_without_memory_adds_no_readings_or_all(monkeypatch: pytest.MonkeyPatch, case: str) -> None:
     monkeypatch.setattr(online_map, 'REFINE_LEAST', 60)
     monkeypatch.setattr(online_map, 'MANY', 50 if case == 'many' else 5000)
     monkeypatch.setattr(threads, 'LEAST_PART', 20)
-    # one in three says what another one said
+    # every third reading repeats an earlier one
     readings = some(3, 100)
     readings = readings.select(np.r_[0:100, 0:50])
     parts = [readings.select(slice(k, k + 24)) for k in range(0, 144, 24)]
     if case == 'grown':
-        # too few for the map to be refined, which has a case of its own
+        # too few readings for a refinement of the map, which has its own case
         parts[1] = dataclasses.replace(parts[1], x=parts[1].x + 9.0, stamp=parts[1].stamp + 10**12)
     if case == 'many':
         parts = [parts[0], readings.select(slice(24, 100)), parts[5]]
     at = {'first': 0, 'more': 1, 'grown': 1, 'refined': 2, 'many': 1}[case]
     if case != 'many':
-        # after the one that fails comes one that says in part what the first has said
+        # after the failing call comes one that repeats part of the first
         parts = [*parts[: at + 1], parts[4]]
     values = {'threads': 3}
     whole = fed(parts, values)
-    # kernels cannot be compiled while numpy's functions are replaced
-    expected, wanted = whole.maps(), kept_of(whole)
+    # kernels cannot be compiled while functions of numpy are replaced
+    expected, wanted = whole.maps(), state_of(whole)
     allocations = Allocations(monkeypatch)
     refused = searched_later = 0
     first = fed(parts[:at], values)
@@ -459,18 +457,18 @@ def test_a_call_that_finds_no_memory_takes_nothing_or_all(monkeypatch: pytest.Mo
         for part in parts[at + 1 :]:
             online.add(part)
         if not accepted or done:
-            assert kept_of(online).same(wanted)
-            for told, map_of in zip(online.maps()[1:], expected[1:], strict=True):
-                assert np.array_equal(told, map_of, equal_nan=True)
+            assert state_of(online).same(wanted)
+            for map_values, map_of in zip(online.maps()[1:], expected[1:], strict=True):
+                assert np.array_equal(map_values, map_of, equal_nan=True)
         assert consistent(online)
         assert online.taken == whole.taken
-        assert kept_of(online).readings == wanted.readings
+        assert state_of(online).readings == wanted.readings
     assert done
     assert refused > 15
     assert searched_later or case == 'first'
 
 
-def test_cells_count_merged_readings_as_often_as_they_came(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_cells_count_merged_readings_with_their_multiplicity(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(online_map, 'REFINE_LEAST', 60)
     readings = some(4, 200)
     online = in_sweeps(readings.select(np.r_[0:200, 0:120, 40:200]), Parameters())
@@ -491,13 +489,13 @@ def test_cells_count_merged_readings_as_often_as_they_came(monkeypatch: pytest.M
 
 
 @pytest.mark.parametrize('drive', ['door', 'corridor'])
-def test_the_map_that_was_searched_can_go_round_for_ever(drive: str) -> None:
+def test_search_from_its_own_result_never_changes_the_map(drive: str) -> None:
     recording = door_drive(3, NOISY) if drive == 'door' else corridor_drive()
     readings = recording.readings.select(slice(0, 3000))
     parameters = Parameters()
     first = maps = Mapper(parameters).run(readings)
     assert first.searched.shape == first.grid.shape
-    # walls are drawn out once
+    # walls are extended only once
     assert (first.searched == 1).sum() < (first.ml == 1).sum()
     for _ in range(3):
         maps = Mapper(parameters).run(readings, start=(maps.grid, maps.searched))
@@ -515,12 +513,12 @@ def test_the_map_that_was_searched_can_go_round_for_ever(drive: str) -> None:
     assert counts.pop()[0] == (first.searched == 1).sum()
 
 
-def test_normals_follow_the_readings() -> None:
+def test_normals_are_those_of_all_readings_at_once() -> None:
     readings = door_drive(3, NOISY, seed=0).readings
     online = in_sweeps(readings, Parameters(), 8)
     online._refine(online._evidence)
     evidence = online._evidence
-    # as if all had come at once
+    # as if all readings had come at once
     kept = Evidence(evidence.grid, evidence.model, start=evidence.state.maps.occupied.reshape(evidence.grid.shape))
     first: dict[int, int] = {}
     for i, key in enumerate(keys_of(online, readings)):
@@ -546,7 +544,7 @@ def scoring_tool(shared: Path) -> ModuleType:
     return module
 
 
-def test_few_readings_of_wide_cones_are_mapped_as_well_as_by_a_batch() -> None:
+def test_few_readings_of_wide_cones_give_a_map_as_good_as_a_batch() -> None:
     wide = sonar_ring(field_of_view=math.radians(30.0))
     recording = door_drive(3, NOISY, seed=0, sonars=wide)
     maps = Mapper(Parameters()).run(recording.readings)
@@ -556,7 +554,7 @@ def test_few_readings_of_wide_cones_are_mapped_as_well_as_by_a_batch() -> None:
 
 
 @pytest.mark.parametrize('name', ['office_a', 'office_b'])
-def test_a_recording_fed_in_sweeps_is_mapped_as_well_as_by_a_batch(shared: Path, name: str) -> None:
+def test_recording_in_sweeps_gives_a_map_as_good_as_a_batch(shared: Path, name: str) -> None:
     tool, folder = scoring_tool(shared), shared / 'data' / name
     truth, origin, resolution = tool.load(folder / 'reference.yaml')
     path_xy = np.loadtxt(folder / 'trajectory.csv', delimiter=',', ndmin=2)

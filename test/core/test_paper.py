@@ -1,4 +1,4 @@
-"""What the printed text of the paper would do where the code departs from it (docs/paper.md lists the departures)."""
+"""The effect of the printed text of the paper where the code differs from it (docs/paper.md lists the differences)."""
 
 from __future__ import annotations
 
@@ -35,13 +35,13 @@ from forward_grid_mapper.simulation.sonar import NOISY
 from samples import PLAIN, FlipsAlone, plain_model, plain_search, random_readings
 
 LINE = Grid(0.1, 0, 0, 12, 1)
-"""One row of cells; cell c lies 0.05 + 0.1 c metres before a sensor at the origin."""
+"""One row of cells; cell c is 0.05 + 0.1 c metres in front of a sensor at the origin."""
 
 AREA = Grid(0.1, 0, 0, 12, 9)
 
 PAPER = plain_model(p_hit=0.6, p_rand=0.1, p_lost=0.0, sigma=0.051)
 
-"""The same with the tails of the noise."""
+"""The model of the paper, with the tails of the noise."""
 
 
 def along(*z: float, **columns: object) -> Readings:
@@ -87,12 +87,12 @@ def search(
 
 
 def found(*arguments: object, **options: object) -> list[int]:
-    """The occupied cells of the map that the search finds."""
+    """The occupied cells of the map found by the search."""
     return np.flatnonzero(search(*arguments, **options).run().occupied).tolist()
 
 
 def gain_of(cell: int, readings: Readings, occupied: np.ndarray, model: ModelParameters = PAPER) -> float:
-    """What the search believes a flip of `cell` of `LINE` to gain."""
+    """The gain of a flip of `cell` of `LINE`, as computed by the search."""
     return gain_of_flip(prepare(readings, LINE, model, occupied).state, no_prior(LINE), cell)
 
 
@@ -103,7 +103,7 @@ def flipped(occupied: np.ndarray, cell: int) -> np.ndarray:
 
 
 def terms(readings: Readings, t: int, grid: Grid, occupied: np.ndarray, model: ModelParameters) -> list[float]:
-    """Density of reading t with each cause: chance, lost echo, no obstacle, first obstacle, second, …"""
+    """Density of reading t with each cause: random, lost echo, no obstacle, first obstacle, second, …"""
     sigma = naive.sigma_of(readings, t, grid, model)
     met = naive.obstacles(readings, t, grid, occupied, model)
     return naive.causes(readings.z[t], readings.z_max[t], sigma, met, model)
@@ -112,7 +112,7 @@ def terms(readings: Readings, t: int, grid: Grid, occupied: np.ndarray, model: M
 # The standard map: (1)-(17), Table 1
 
 
-def test_one_reading_gives_back_its_inverse_model_and_not_eq_4_as_printed() -> None:
+def test_one_reading_gives_its_inverse_model_and_not_eq_4_as_printed() -> None:
     values = {'resolution': 0.1, 'live_p_occupied': 0.8, 'live_p_free': 0.25}
     live = LogOddsMap(Parameters().varied({**values}))
     live.add(along(0.55))
@@ -123,7 +123,7 @@ def test_one_reading_gives_back_its_inverse_model_and_not_eq_4_as_printed() -> N
     assert printed[2] < 0, 'not a probability'
 
 
-def test_readings_that_say_nothing_leave_the_standard_map_at_its_prior() -> None:
+def test_uninformative_readings_keep_the_standard_map_at_its_prior() -> None:
     silent = {'live_p_occupied': 0.5, 'live_p_free': 0.5, 'live_p_free_no_echo': 0.5}
     live = LogOddsMap(Parameters().varied({'resolution': 0.1, **silent}))
     live.add(random_readings(np.random.default_rng(0), AREA, 50))
@@ -133,14 +133,14 @@ def test_readings_that_say_nothing_leave_the_standard_map_at_its_prior() -> None
 
 
 def closed_form(each: np.ndarray, prior: float) -> np.ndarray:
-    """(16) as it must be meant: the log-odds of every reading, less the prior's T times, plus the prior's once.
+    """(16) as it must be meant: the log-odds of all readings, less the prior T times, plus the prior once.
 
-    `each`, shape (T, cells), has the occupancy of the cells given each reading alone.
+    `each`, shape (T, cells), has the occupancy of the cells given each single reading.
     """
     return np.log(each / (1 - each)).sum(axis=0) - (len(each) - 1) * math.log(prior / (1 - prior))
 
 
-def test_the_standard_map_is_the_closed_form_of_eq_16_with_logarithms() -> None:
+def test_standard_map_is_the_closed_form_of_eq_16_with_logarithms() -> None:
     parameters = Parameters().varied({'resolution': 0.1, **ONE_SUM})
     readings = random_readings(np.random.default_rng(1), AREA, 40)
     live = LogOddsMap(parameters)
@@ -150,7 +150,7 @@ def test_the_standard_map_is_the_closed_form_of_eq_16_with_logarithms() -> None:
         alone = LogOddsMap(parameters)
         alone.add(readings.select(np.array([t])))
         p = alone.probability(live.grid)
-        # a reading leaves the cells beside its cone at the prior, which is one half
+        # a reading keeps cells beside its cone at the prior of one half
         each.append(np.where(np.isnan(p), 0.5, p))
     odds = np.array(each, np.float64)
     known = np.isfinite(live.log_odds())
@@ -160,7 +160,7 @@ def test_the_standard_map_is_the_closed_form_of_eq_16_with_logarithms() -> None:
 
 
 @pytest.mark.parametrize('prior', [0.2, 0.5, 0.7])
-def test_the_closed_form_takes_the_prior_off_with_every_reading_and_adds_it_once(prior: float) -> None:
+def test_closed_form_subtracts_the_prior_for_each_reading(prior: float) -> None:
     each = np.random.default_rng(2).uniform(0.05, 0.95, (12, 5))
     h = math.log(prior / (1 - prior))
     recursive = np.full(5, h)
@@ -181,27 +181,27 @@ def test_sigma_of_eq_22_is_a_standard_deviation() -> None:
     assert density[1] / density[0] == pytest.approx(math.exp(-0.5))
 
 
-def test_chance_knows_no_distance_whatever_eq_32_prints() -> None:
+def test_random_readings_do_not_depend_on_distance_unlike_eq_32() -> None:
     readings = along(*np.arange(0.05, 0.8, 0.05))
-    told = expectations(readings, LINE, line(), PAPER)
-    assert told.log_likelihood == pytest.approx(math.log(PAPER.p_rand / 1.1))
-    # so readings by chance do not widen the sigma that is learned
+    actual = expectations(readings, LINE, line(), PAPER)
+    assert actual.log_likelihood == pytest.approx(math.log(PAPER.p_rand / 1.1))
+    # so random readings do not increase the learned sigma
     readings = along(*[0.5, 0.6] * 20, *[0.15] * 10)
     assert learn(ForwardModel(readings, LINE, PAPER), line(5)).sigma == pytest.approx(0.05, abs=1e-3)
 
 
 @pytest.mark.parametrize('occupied', [line(), line(5), line(2, 5, 6)])
-def test_the_density_of_a_reading_integrates_to_one(occupied: np.ndarray) -> None:
-    # it would not if eq 36 multiplied by the root, or if e_{t,0} lacked (1 - p_rand) as in Table 2
+def test_density_of_a_reading_integrates_to_one(occupied: np.ndarray) -> None:
+    # not so if eq 36 multiplied by the root, or if e_{t,0} lacked (1 - p_rand) as in Table 2
     step = 1e-3
     readings = along(*np.arange(step / 2, 1.1, step))
     below = np.exp(expectations(readings, LINE, occupied, PAPER).log_likelihood).sum() * step
-    # half of the normal around z_max lies beyond z_max, where no reading can be
+    # half of the normal density around z_max is beyond z_max, where no reading can be
     beyond = (1 - PAPER.p_rand) * (1 - PAPER.p_hit) ** occupied.sum() / 2
     assert below + beyond == pytest.approx(1.0, abs=1e-3)
 
 
-def test_without_its_factor_the_no_echo_expectation_of_table_2_makes_the_sum_exceed_one() -> None:
+def test_no_echo_expectation_of_table_2_makes_the_sum_exceed_one() -> None:
     readings, model = along(1.1, 1.08, 1.04), replace(PAPER, p_rand=0.3)
     occupied = line(3)
     e = expectations(readings, LINE, occupied, model)
@@ -214,15 +214,15 @@ def test_without_its_factor_the_no_echo_expectation_of_table_2_makes_the_sum_exc
         assert e.no_echo[t] == pytest.approx(nothing / likelihood)
 
 
-def test_every_obstacle_of_the_cone_counts_not_only_one() -> None:
-    # an echo from behind a missed obstacle is explained by the second
+def test_all_obstacles_of_the_cone_count() -> None:
+    # an echo from behind a missed obstacle is explained by the second obstacle
     readings, occupied = along(0.75), line(3, 7)
     e = expectations(readings, LINE, occupied, PAPER)
     assert e.hit[0] > 0.9
     assert e.rank[0] / e.hit[0] == pytest.approx(2.0, abs=1e-6)
     chance, _, nothing, first, _ = terms(readings, 0, LINE, occupied, PAPER)
     assert first + nothing < 1e-6 * chance
-    # nor would the cell of the echo ever be occupied
+    # otherwise the cell of the echo would never be occupied
     assert gain_of(7, readings, line(3)) == pytest.approx(-math.log(e.random[0]), abs=1e-5)
 
 
@@ -236,7 +236,7 @@ def squares(readings: Readings, grid: Grid, occupied: np.ndarray, model: ModelPa
 
 
 def descend(cost: Callable[[np.ndarray], float], occupied: np.ndarray) -> np.ndarray:
-    """Flip the cell that lowers `cost` most until none does."""
+    """Flip the cell that lowers `cost` most until no flip lowers it."""
     while True:
         trials = [flipped(occupied, c) for c in range(occupied.size)]
         costs = [cost(trial) for trial in trials]
@@ -257,15 +257,15 @@ def test_minimising_eq_40_alone_empties_the_map(seed: int) -> None:
 
 
 def stale_gain(readings: Readings, occupied: np.ndarray, cell: int) -> float:
-    """The gain of a flip with the expectations of before, tied to ranks: e_{t,k} weighs whatever is k-th afterwards."""
+    """The gain of a flip with the expectations from before, tied to ranks: e_{t,k} weighs the obstacle of rank k."""
     gain = 0.0
     with pytest.MonkeyPatch.context() as patch:
-        # no density is nil
+        # no density is zero
         patch.setattr(naive, 'CUT', 40.0)
         for t in range(len(readings)):
             before = terms(readings, t, LINE, occupied, PAPER)
             after = terms(readings, t, LINE, flipped(occupied, cell), PAPER)
-            # random measurements do not change, and a lost echo is no cause here
+            # random measurements do not change, and lost echoes are not a cause here
             for k in range(2, min(len(before), len(after))):
                 gain += before[k] / sum(before) * math.log(after[k] / before[k])
     return gain
@@ -276,7 +276,7 @@ def stale_gain(readings: Readings, occupied: np.ndarray, cell: int) -> float:
     [(2, line(5), [0.55] * 3 + [0.25] * 3), (2, line(2, 5, 7), [0.55] * 5)],
     ids=['occupying', 'freeing'],
 )
-def test_stale_expectations_refuse_a_flip_that_the_exact_e_step_takes(
+def test_stale_expectations_reject_a_flip_that_the_exact_e_step_takes(
     cell: int, before: np.ndarray, ranges: Sequence[float]
 ) -> None:
     readings = along(*ranges)
@@ -287,14 +287,14 @@ def test_stale_expectations_refuse_a_flip_that_the_exact_e_step_takes(
     assert stale_gain(readings, before, cell) < -20
 
 
-def test_evidence_is_positive_for_what_returned_the_echo_and_negative_before_it() -> None:
+def test_evidence_is_positive_at_the_echo_and_negative_in_front_of_it() -> None:
     for start in (line(), line(2), line(5)):
-        told = search(along(0.55, 0.55, 0.55), start=start, prior=0.2).run().evidence
-        assert told[5] > 5
-        assert told[:4].max() < -2
+        actual = search(along(0.55, 0.55, 0.55), start=start, prior=0.2).run().evidence
+        assert actual[5] > 5
+        assert actual[:4].max() < -2
 
 
-def test_cells_that_nobody_saw_stay_as_they_are_though_table_2_would_fill_them() -> None:
+def test_unseen_cells_stay_unchanged_although_table_2_fills_them() -> None:
     readings = along(0.35, 0.35)
     result = search(readings, start=line(9), prior=0.2).run()
     assert (result.evidence >= 0)[7:].all(), 'which Table 2 takes for occupied'
@@ -302,8 +302,8 @@ def test_cells_that_nobody_saw_stay_as_they_are_though_table_2_would_fill_them()
     assert found(readings, prior=0.2) == [3]
 
 
-def test_a_tie_keeps_the_state() -> None:
-    # the echo comes from between two cells: either explains it, and moving from one to the other gains nothing
+def test_tie_keeps_the_state() -> None:
+    # the echo is between two cells: both explain it equally, and moving from one to the other gains nothing
     readings = along(0.5, 0.5, 0.5)
     truth = [naive.log_likelihood(readings, LINE, line(c), PAPER) for c in (4, 5)]
     assert truth[0] == pytest.approx(truth[1], abs=1e-9)
@@ -311,11 +311,11 @@ def test_a_tie_keeps_the_state() -> None:
 
 
 Order = Callable[[np.ndarray, np.ndarray], np.ndarray]
-"""(cells that gain, gain of every cell) → the same cells in the order in which a sweep visits them."""
+"""(cells that gain, gain of each cell) → the same cells in the order of a sweep"""
 
 
 def climb(readings: Readings, grid: Grid, order: Order, model: ModelParameters = PAPER) -> np.ndarray:
-    """Single flips, sweep by sweep, until none gains."""
+    """Single flips, sweep by sweep, until no flip gains."""
     state = prepare(readings, grid, model).state
     least = LEAST[0] + LEAST[1] * state.maps.seen
     for _ in range(200):
@@ -324,7 +324,7 @@ def climb(readings: Readings, grid: Grid, order: Order, model: ModelParameters =
         if not len(cells):
             return state.maps.occupied.reshape(grid.shape)
         cells = order(cells, gain)
-        # what they gained at first does not matter: none waits
+        # gains from before do not matter: no cell waits
         flip_in_order(state, no_prior(grid), LEAST, cells, np.zeros(len(cells)))
     raise AssertionError('the sweeps do not end')
 
@@ -342,7 +342,7 @@ def shuffled(seed: int) -> Order:
     return lambda cells, gain: rng.permutation(cells)
 
 
-def test_the_search_can_be_trapped_since_orders_end_in_different_optima() -> None:
+def test_different_orders_of_flips_end_in_different_optima() -> None:
     recording = door_drive(1, NOISY, seed=0)
     readings, grid = recording.readings, recording.world.grid
     model = replace(PAPER, p_hit=0.9, p_rand=0.05)
@@ -361,14 +361,14 @@ def test_most_promising_cells_first_ends_higher_than_other_orders() -> None:
     assert heights[0] > max(heights[1:]) + 20
 
 
-def test_a_move_leaves_a_place_that_no_single_flip_can() -> None:
+def test_move_leaves_an_optimum_of_single_flips() -> None:
     model = replace(PAPER, p_hit=0.98)
     readings, start = along(0.55, 0.55, 0.55, 0.55), line(4)
     assert found(readings, model=model, start=start, prior=0.2, kind=FlipsAlone) == [4]
     assert found(readings, model=model, start=start, prior=0.2) == [5]
 
 
-def test_the_search_starts_from_the_empty_map_since_what_nobody_saw_stays_full() -> None:
+def test_search_starts_from_the_empty_map_since_unseen_cells_stay() -> None:
     recording = door_drive(1, NOISY, seed=0)
     readings, grid = recording.readings, recording.world.grid
     assert not search(readings, grid).evidence.state.maps.occupied.any()
@@ -385,7 +385,7 @@ def test_the_search_starts_from_the_empty_map_since_what_nobody_saw_stays_full()
 # Uncertainty: (41)-(45)
 
 
-def test_the_mixed_marginal_is_that_of_eq_42_to_45_with_the_prior_counted_once() -> None:
+def test_mixed_marginal_is_that_of_eq_42_to_45_with_one_prior() -> None:
     readings = along(0.55, 0.62, 0.35, 1.1)
     result = search(readings, prior=0.3).run()
     occupied = result.occupied.reshape(LINE.shape)
@@ -400,19 +400,19 @@ def test_the_mixed_marginal_is_that_of_eq_42_to_45_with_the_prior_counted_once()
         assert q[c] == pytest.approx(mixed[0] / sum(mixed), abs=1e-5)
 
 
-def test_without_evidence_the_marginal_is_the_prior_at_any_alpha() -> None:
+def test_marginal_without_evidence_is_the_prior_at_any_alpha() -> None:
     prior = 0.2
     h = math.log(prior / (1 - prior))
     for alpha in (0.0, 0.3, 1.0):
         q = float(marginals(np.zeros(1), plain_search(alpha=alpha, prior=prior))[0])
         assert q == pytest.approx(prior)
-        # Table 2's last line mixes in the prior as if the likelihood ratio contained it already
+        # the last line of Table 2 mixes in the prior as if the likelihood ratio already contained it
         printed = 1 / (1 + math.exp(-(1 - alpha) * h))
         assert alpha == 0.0 or printed > prior + 0.05
 
 
 def given_likeliest_cause(readings: Readings, occupied: np.ndarray, distances: np.ndarray) -> float:
-    """log p(Z | m, C) of eq 26, without the prior of the correspondences C: each reading's likeliest cause."""
+    """log p(Z | m, C) of eq 26, without the prior of the correspondences C: the most likely cause of each reading."""
     total = 0.0
     for t in range(len(readings)):
         sigma = naive.sigma_of(readings, t, LINE, PAPER)
@@ -423,7 +423,7 @@ def given_likeliest_cause(readings: Readings, occupied: np.ndarray, distances: n
     return total
 
 
-def test_eq_26_alone_says_nothing_of_the_free_space_before_an_obstacle() -> None:
+def test_eq_26_alone_gives_no_evidence_in_front_of_an_obstacle() -> None:
     readings, occupied = along(*[0.55] * 5), line(5)
     distances = LINE.centers()[0]
     alone = given_likeliest_cause(readings, flipped(occupied, 2), distances)
@@ -436,11 +436,11 @@ def test_eq_26_alone_says_nothing_of_the_free_space_before_an_obstacle() -> None
     assert q[1] < 0.02
 
 
-# Choices of our own
+# Our own choices
 
 
-def test_readings_without_echo_hold_the_free_space() -> None:
-    # two ranges by chance in the open, where ten others heard nothing
+def test_readings_without_echo_keep_cells_free() -> None:
+    # two random ranges in open space, where ten others have no echo
     readings = along(0.55, 0.55, *[1.1] * 10)
     parameters = replace(Parameters().varied({**PLAIN, 'resolution': 0.1, 'prior': 0.3}), model=PAPER)
     whole, echoes = (Mapper(parameters).run(part) for part in (readings, readings.select(readings.echo)))
@@ -449,7 +449,7 @@ def test_readings_without_echo_hold_the_free_space() -> None:
     assert echoes.grid.width <= 9, 'and nothing known beyond'
 
 
-def test_without_a_floor_of_chance_the_empty_map_is_impossible() -> None:
+def test_empty_map_is_impossible_without_random_readings() -> None:
     readings = along(0.55, 0.55, 1.1)
     none, least = (replace(PAPER, p_rand=p) for p in (0.0, find('p_rand').low))
     assert log_likelihood(readings, LINE, line(), none) == -math.inf
@@ -459,17 +459,17 @@ def test_without_a_floor_of_chance_the_empty_map_is_impossible() -> None:
         Parameters.from_flat({'p_rand': 0.0})
 
 
-def test_the_floor_bounds_what_one_silent_reading_can_say_against_obstacles() -> None:
+def test_evidence_of_a_reading_without_echo_is_bounded_by_p_rand() -> None:
     readings = along(1.1)
     bound = math.log(PAPER.p_rand / 1.1)
-    told = [log_likelihood(readings, LINE, line(*range(n)), PAPER) for n in range(12)]
-    assert min(told) > bound
-    assert told[11] - bound < 0.01
+    actual = [log_likelihood(readings, LINE, line(*range(n)), PAPER) for n in range(12)]
+    assert min(actual) > bound
+    assert actual[11] - bound < 0.01
     unbounded = 11 * math.log(1 - PAPER.p_hit)
-    assert told[11] - told[0] > unbounded + 3
+    assert actual[11] - actual[0] > unbounded + 3
 
 
-def test_p_hit_stays_below_one_since_freeing_divides_by_the_rest() -> None:
+def test_p_hit_is_below_one_since_freeing_divides_by_the_rest() -> None:
     with pytest.raises(ParameterError, match='p_hit'):
         Parameters.from_flat({'p_hit': 1.0})
     top = replace(PAPER, p_hit=find('p_hit').high, p_rand=find('p_rand').low)
@@ -480,7 +480,7 @@ def test_p_hit_stays_below_one_since_freeing_divides_by_the_rest() -> None:
         assert gain_of(c, readings, occupied, top) == pytest.approx(truth, abs=1e-5)
 
 
-def test_echoes_that_may_be_lost_do_not_wipe_out_a_smooth_wall() -> None:
+def test_lost_echoes_do_not_remove_a_smooth_wall() -> None:
     readings = along(*[0.55] * 3, *[1.1] * 12)
     paper, ours = (replace(PAPER, p_hit=0.9, p_rand=0.05, p_lost=p) for p in (0.0, 0.3))
     assert found(readings, model=paper) == []
@@ -488,7 +488,7 @@ def test_echoes_that_may_be_lost_do_not_wipe_out_a_smooth_wall() -> None:
 
 
 def test_walls_near_the_largest_range_are_no_lost_echoes() -> None:
-    # a robot passes a wall 0.15 m within the largest range and hears it all the way
+    # a robot passes a wall 0.15 m within the largest range, with echoes all along
     readings = Readings.from_columns(
         x=0.2 * np.arange(40), y=0.05, yaw=math.pi / 2, z=np.full(40, 2.85), z_max=3.0, half_angle=0.2
     )
@@ -499,7 +499,7 @@ def test_walls_near_the_largest_range_are_no_lost_echoes() -> None:
 
 
 @pytest.mark.parametrize('seed', range(3))
-def test_the_tails_of_the_noise_change_no_gain_by_much(seed: int, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_tails_of_the_noise_hardly_change_gains(seed: int, monkeypatch: pytest.MonkeyPatch) -> None:
     grid = Grid(0.1, 0, 0, 7, 6)
     rng = np.random.default_rng(seed)
     readings, occupied = random_readings(rng, grid, 40), (rng.random(grid.shape) < 0.1).astype(np.uint8)
@@ -512,14 +512,14 @@ def test_the_tails_of_the_noise_change_no_gain_by_much(seed: int, monkeypatch: p
     assert np.abs(ends[CUT] - ends[40.0]).max() < 0.1
 
 
-def test_a_thin_cone_without_a_cell_centre_still_sees_the_cells_on_its_axis() -> None:
+def test_thin_cone_without_a_cell_centre_sees_the_cells_on_its_axis() -> None:
     readings = along(*[0.55] * 3, y=0.02, half_angle=0.01)
     bearings = np.arctan2(0.05 - 0.02, LINE.centers()[0])
     assert (np.abs(bearings) > 0.01).all(), 'no centre lies in the cone'
     assert found(readings, prior=0.3) == [5]
 
 
-def test_a_sigma_below_half_a_cell_would_leave_ranges_that_no_cell_explains() -> None:
+def test_sigma_below_half_a_cell_would_leave_unexplained_ranges() -> None:
     fine = 0.004
     model = replace(PAPER, sigma=fine)
     for z in np.arange(0.505, 0.6, 0.01):
@@ -527,8 +527,8 @@ def test_a_sigma_below_half_a_cell_would_leave_ranges_that_no_cell_explains() ->
     assert naive.normal(0.595, 0.55, fine) == 0.0
 
 
-def test_a_surface_may_lie_before_the_centre_of_its_cell() -> None:
-    # a wall that fills cell 5 is met at its near face, or anywhere up to its centre
+def test_surface_may_be_in_front_of_the_centre_of_its_cell() -> None:
+    # a wall that fills cell 5 returns the echo at its near face, or anywhere up to its centre
     for offset in (0.0, 0.3, 0.5):
         e = expectations(along(0.55 - 0.1 * offset), LINE, line(5), replace(PAPER, surface_offset=offset))
         assert math.sqrt(e.squared_error[0] / e.hit[0]) == pytest.approx(0.0, abs=1e-7)
@@ -537,7 +537,7 @@ def test_a_surface_may_lie_before_the_centre_of_its_cell() -> None:
     assert found(near_face, prior=0.3, model=replace(PAPER, surface_offset=0.3)) == [5]
 
 
-def test_a_prior_spares_the_dot_of_a_single_stray_reading_and_keeps_the_wall() -> None:
+def test_prior_removes_the_dot_of_a_stray_reading_and_keeps_the_wall() -> None:
     stray, wall = along(0.25), along(*[0.75] * 3)
     assert 2 in found(stray, prior=0.5)
     assert found(stray, prior=0.001) == []

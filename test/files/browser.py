@@ -1,4 +1,4 @@
-"""A page in a headless browser: a script is run in it once it is ready, and what the script finds comes back."""
+"""Runs a script in a page in a headless browser and returns its result."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ const timer = setInterval(async () => {
 
 
 def found_in(page: Path, folder: Path, script: str, width: int = 1280, height: int = 800) -> Any:
-    """Return what a script returns that runs in the page; skips the test where there is no browser."""
+    """Return the result of a script that runs in the page; skip the test if there is no browser."""
     browser = next(filter(None, map(shutil.which, NAMES)), None)
     if browser is None:
         pytest.skip(f'none of {", ".join(NAMES)} is installed')

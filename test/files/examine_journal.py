@@ -1,7 +1,7 @@
-"""Reads a journal as process_bag does, in a process of its own: `examine_journal.py FILE [pause]`.
+"""Read a journal as process_bag does, in a separate process: `examine_journal.py FILE [pause]`.
 
-Tells as JSON how many readings there are, what is wrong with the file, and how many MB it took. With `pause` it waits
-for a line on standard input after the first readings.
+Print as JSON the number of readings, the faults of the file, and the memory in MB. With `pause`, wait for a line on
+standard input after the first readings.
 """
 
 from __future__ import annotations

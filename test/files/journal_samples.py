@@ -1,4 +1,4 @@
-"""What the tests of journals share: readings, journals of both formats, and waiting for events."""
+"""Helpers of the tests of journals: readings, journals of both formats, and waiting for a condition."""
 
 from __future__ import annotations
 
@@ -37,8 +37,8 @@ def made(first: int, count: int, names: tuple[str, ...] = ('left', 'right')) -> 
     )
 
 
-def opened(folder: Path, said: list[str] | None = None) -> tuple[Journal, list[Readings]]:
-    journal = Journal(folder, (said if said is not None else []).append)
+def opened(folder: Path, warnings: list[str] | None = None) -> tuple[Journal, list[Readings]]:
+    journal = Journal(folder, (warnings if warnings is not None else []).append)
     return journal, list(journal.restore())
 
 
@@ -62,7 +62,7 @@ def numbers(path: Path) -> tuple[list[int], Contents]:
 def database(
     path: Path, rows: Iterable[bytes] = (), names: Iterable[bytes] = (b'left', b'right')
 ) -> sqlite3.Connection:
-    """Make a journal's file by hand, which may then be changed; its blocks follow one another."""
+    """Make the file of a journal by hand, which tests then change; its blocks are consecutive."""
     made = sqlite3.connect(path, isolation_level=None)
     for sql in TABLES.values():
         made.execute(sql)
@@ -111,7 +111,7 @@ class Previous:
 
     @classmethod
     def file(cls, count: int, size: int = 10) -> bytes:
-        """A sound file of blocks of so many readings."""
+        """A valid file with blocks of `size` readings."""
         blocks = [cls.MAGIC, cls.frames(), cls.name(0, 'left'), cls.name(1, 'right')]
         for first in range(0, count, size):
             blocks += [cls.path([(float(first), 0.0)]), cls.readings(rows(made(first, size)))]

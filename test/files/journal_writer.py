@@ -1,6 +1,7 @@
-"""Writes a journal as a node does, until it is killed: `journal_writer.py FOLDER`.
+"""Write a journal as the node does, until killed: `journal_writer.py FOLDER`.
 
-Reading number n has n as its x. The file `FOLDER.accepted` says how many there were and when (int64, int64).
+Reading number n has n as its x. The file `FOLDER.accepted` has the number of accepted readings and the time (int64,
+int64).
 """
 
 from __future__ import annotations
@@ -20,7 +21,7 @@ def main(folder: str) -> None:
     for readings in journal.restore():
         buffer.extend(readings)
     taken = len(buffer)
-    # what is written to a file outlives the writer
+    # data written to a file survives the death of the writer
     accepted = os.open(f'{folder}.accepted', os.O_WRONLY | os.O_CREAT | os.O_APPEND)
     while True:
         for _ in range(10):

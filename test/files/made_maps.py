@@ -19,7 +19,7 @@ def made_maps(
     settings: dict[str, Any] | None = None,
     statistics: dict[str, Any] | None = None,
 ) -> MapSet:
-    """Return a room with walls all round, in a grid whose rim nobody observed."""
+    """Return a room with walls all round, in a grid whose outer cells no reading observed."""
     random = np.random.default_rng(1)
     ml = np.full((height, width), -1, np.int8)
     ml[2:-2, 2:-2] = 1

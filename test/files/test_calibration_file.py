@@ -1,4 +1,4 @@
-"""The file of a calibration: what is told comes back, and what is not stays out."""
+"""The file of a calibration: its values are read back, unknown ones are left out, and bad files are rejected."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from forward_grid_mapper.core.common.errors import ParameterError
 from forward_grid_mapper.core.trajectory.certainty import Estimate
 from forward_grid_mapper.files.calibration_file import calibration_text, load_calibration
 
-TOLD = {
+CALIBRATION = {
     'scale': Estimate(0.012, 0.004),
     'heading': Estimate(-0.01, 0.003),
     'bias': Estimate(math.radians(0.5), math.radians(0.1)),
@@ -20,11 +20,11 @@ TOLD = {
 }
 
 
-def test_what_is_told_comes_back(tmp_path: Path) -> None:
-    text = calibration_text(TOLD, 'monday')
+def test_calibration_file_is_read_back(tmp_path: Path) -> None:
+    text = calibration_text(CALIBRATION, 'monday')
     (tmp_path / 'calibration.yaml').write_text(text)
     found = load_calibration(tmp_path / 'calibration.yaml')
-    assert found == pytest.approx({name: value for name, (value, _) in TOLD.items()}, abs=2e-4)
+    assert found == pytest.approx({name: value for name, (value, _) in CALIBRATION.items()}, abs=2e-4)
     figures = yaml.safe_load(text)
     assert figures['travel_factor'] == 1.012
     assert figures['turn_per_metre_deg'] == 0.5
@@ -32,15 +32,15 @@ def test_what_is_told_comes_back(tmp_path: Path) -> None:
     assert 'of monday' in text
 
 
-def test_what_is_not_told_is_left_out_in_words() -> None:
-    text = calibration_text({'bias': TOLD['bias']}, 'two\nlines')
+def test_unknown_values_are_left_out_with_a_comment() -> None:
+    text = calibration_text({'bias': CALIBRATION['bias']}, 'two\nlines')
     assert list(yaml.safe_load(text)) == ['turn_per_metre_deg']
     assert '# travel_factor: not known; this drive does not determine it' in text
     assert calibration_text({}, 'monday') == ''
 
 
 @pytest.mark.parametrize(
-    ('text', 'said'),
+    ('text', 'reason'),
     [
         ('', 'contains no calibration'),
         ('- 1.0', 'contains no calibration'),
@@ -53,11 +53,11 @@ def test_what_is_not_told_is_left_out_in_words() -> None:
         ('turn_per_metre_deg: 90', 'which is not possible for a calibration of wheels'),
     ],
 )
-def test_what_is_wrong_is_told_with_the_file(tmp_path: Path, text: str, said: str) -> None:
+def test_bad_calibration_file_is_rejected_with_reason(tmp_path: Path, text: str, reason: str) -> None:
     file = tmp_path / 'calibration.yaml'
     file.write_text(text)
     with pytest.raises(ParameterError, match='calibration') as caught:
         load_calibration(file)
-    assert said in str(caught.value)
+    assert reason in str(caught.value)
     with pytest.raises(ParameterError, match='absent'):
         load_calibration(tmp_path / 'absent.yaml')

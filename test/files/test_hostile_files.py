@@ -1,4 +1,4 @@
-"""Files from strangers: whatever their bytes are, they are read or refused in words, soon and without a traceback."""
+"""Files with arbitrary bytes are read or rejected with a message, in limited time and without a traceback."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ def garbled(content: bytes, rng: random.Random) -> bytes:
 
 
 def survives(read: Callable[[Path], object], path: Path) -> bool:
-    """Whether the file is read; if not, it must be refused in words."""
+    """Whether the file is read; if not, it must be rejected with a message."""
     begin = time.monotonic()
     try:
         read(path)
@@ -91,7 +91,7 @@ def survives(read: Callable[[Path], object], path: Path) -> bool:
         '\x00',
     ],
 )
-def test_parameter_files_that_cannot_be(tmp_path: Path, text: str) -> None:
+def test_malicious_parameter_file_is_rejected_in_time(tmp_path: Path, text: str) -> None:
     path = tmp_path / 'p.yaml'
     path.write_text(text)
     begin = time.monotonic()
@@ -100,7 +100,7 @@ def test_parameter_files_that_cannot_be(tmp_path: Path, text: str) -> None:
     assert time.monotonic() - begin < 10.0
 
 
-def test_garbled_parameter_files(tmp_path: Path) -> None:
+def test_garbled_parameter_file_is_read_or_rejected(tmp_path: Path) -> None:
     rng = random.Random(1)
     content = (CONFIG / 'ring_24.yaml').read_bytes()[:800]
     path = tmp_path / 'p.yaml'
@@ -109,7 +109,7 @@ def test_garbled_parameter_files(tmp_path: Path) -> None:
         survives(load_parameters, path)
 
 
-def test_garbled_maps(tmp_path: Path) -> None:
+def test_garbled_map_is_read_or_rejected(tmp_path: Path) -> None:
     rng = random.Random(2)
     grid = Grid(0.1, 0, 0, 7, 5)
     path = write_trinary(tmp_path / 'map', grid, np.zeros(grid.shape, np.int8))
@@ -121,7 +121,7 @@ def test_garbled_maps(tmp_path: Path) -> None:
         survives(read_map, path)
 
 
-def test_garbled_archives(tmp_path: Path) -> None:
+def test_garbled_archive_is_read_or_rejected(tmp_path: Path) -> None:
     rng = random.Random(3)
     path = tmp_path / 'maps.npz'
     write_npz(path, made_maps())

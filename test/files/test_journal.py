@@ -1,4 +1,4 @@
-"""The journal: what was put comes back, whatever happens to the process, the disk and the file."""
+"""The journal: readings are read back after faults of the process, the disk and the file."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ def names_in(folder: Path) -> list[str]:
     return sorted(path.name for path in folder.iterdir())
 
 
-def test_what_is_put_comes_back(tmp_path: Path) -> None:
+def test_readings_of_a_journal_are_read_back(tmp_path: Path) -> None:
     names = ('ultra sonic/../left', '超音波', '', 'new\nline', '\udcff')
     journal, before = opened(tmp_path / 'a b %41?#' / 'журнал')
     assert before == []
@@ -57,11 +57,11 @@ def test_what_is_put_comes_back(tmp_path: Path) -> None:
     assert again.contents.path == [(0.0, 0.0), (100.0, 0.0), (200.0, 0.0)]
     assert again.contents.harm == ''
     again.close()
-    # a frame is a name and never a path
+    # a frame is a name, never a path
     assert sorted(p.name for p in tmp_path.rglob('*')) == ['a b %41?#', 'drive_0001.journal', 'lock', 'журнал']
 
 
-def test_the_parameters_of_the_node_come_back(tmp_path: Path) -> None:
+def test_parameters_of_the_node_are_read_back(tmp_path: Path) -> None:
     journal, _ = opened(tmp_path)
     journal.parameters = {'resolution': 0.05, 'max_readings': 7, 'over_range': 'discard', 'unheard_of': 1, 'p_hit': 9.0}
     written(journal, made(0, 10))
@@ -69,12 +69,12 @@ def test_the_parameters_of_the_node_come_back(tmp_path: Path) -> None:
     written(journal, made(10, 10))
     journal.close()
     _, contents = numbers(journal.path)
-    # what this version does not know or admit is passed over
+    # unknown or invalid parameters are ignored
     assert contents.parameters == {'resolution': 0.05, 'max_readings': 8, 'over_range': 'discard'}
     assert contents.harm == ''
 
 
-def test_one_writer_at_a_time(tmp_path: Path) -> None:
+def test_folder_has_one_writer_at_a_time(tmp_path: Path) -> None:
     journal, _ = opened(tmp_path)
     with pytest.raises(OutputError, match='another node'):
         Journal(tmp_path, print)
@@ -82,7 +82,7 @@ def test_one_writer_at_a_time(tmp_path: Path) -> None:
     opened(tmp_path)[0].close()
 
 
-def test_a_file_that_another_program_has_open(tmp_path: Path) -> None:
+def test_journal_open_in_another_program_is_rejected(tmp_path: Path) -> None:
     journal, _ = opened(tmp_path)
     written(journal, made(0, 10))
     journal.close()
@@ -95,21 +95,21 @@ def test_a_file_that_another_program_has_open(tmp_path: Path) -> None:
     other.close()
     journal, chunks = opened(tmp_path)
     assert sum(map(len, chunks)) == 10
-    # nor can another program hold up the node
+    # another program cannot block the node either
     other = sqlite3.connect(journal.path, timeout=0.0)
     with pytest.raises(sqlite3.OperationalError, match='locked'):
         other.execute('SELECT * FROM sensors')
     journal.close()
 
 
-def test_a_new_drive_begins_a_new_file(tmp_path: Path) -> None:
+def test_new_drive_begins_a_new_file(tmp_path: Path) -> None:
     journal, _ = opened(tmp_path)
     journal.begin_drive()
     assert journal.path.name == 'drive_0001.journal'
     written(journal, made(0, 10))
     journal.begin_drive()
     until(lambda: len(drives(tmp_path)) == 2)
-    # also where nothing comes before the node dies
+    # also if the node dies before it receives readings
     assert numbers(drives(tmp_path)[1])[0] == []
     written(journal, made(10, 10))
     assert names_in(tmp_path) == ['drive_0001.journal', 'drive_0002.journal', 'drive_0002.journal-wal', 'lock']
@@ -126,7 +126,7 @@ def test_a_new_drive_begins_a_new_file(tmp_path: Path) -> None:
     again.close()
 
 
-def test_commits_come_soon_and_put_never_waits(tmp_path: Path) -> None:
+def test_put_does_not_wait_for_commits(tmp_path: Path) -> None:
     journal, _ = opened(tmp_path)
     written(journal, made(0, 10))
     begin = time.monotonic()
@@ -136,14 +136,14 @@ def test_commits_come_soon_and_put_never_waits(tmp_path: Path) -> None:
     journal.close()
 
 
-# a file that is not there any more
+# a file that was deleted or replaced
 
 
 @pytest.mark.parametrize('what', ['file', 'log', 'both', 'folder', 'moved', 'replaced', 'file cut', 'log cut'])
-def test_a_file_that_goes_is_noticed_and_begun_anew(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, what: str) -> None:
+def test_deleted_journal_is_detected_and_replaced(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, what: str) -> None:
     monkeypatch.setattr(journal_module, 'CHECK_PERIOD', 0.01)
-    folder, said = tmp_path / 'j', []
-    journal, _ = opened(folder, said)
+    folder, warnings = tmp_path / 'j', []
+    journal, _ = opened(folder, warnings)
     for k in range(3):
         written(journal, made(10 * k, 10))
     path = journal.path
@@ -162,11 +162,11 @@ def test_a_file_that_goes_is_noticed_and_begun_anew(tmp_path: Path, monkeypatch:
         os.truncate(path, 5000)
     if what == 'log cut':
         os.truncate(log_of(path), 5000)
-    # also while nothing is put
+    # also if no readings are put
     until(lambda: journal.gone)
-    assert 'the readings in memory are written to a new file' in said[0]
-    assert journal.notice == said[0]
-    # what came before it was told
+    assert 'the readings in memory are written to a new file' in warnings[0]
+    assert journal.notice == warnings[0]
+    # the warning before it was given
     journal.put(made(30, 10), FRAMES)
     journal.renew(made(0, 40), FRAMES, [(0.0, 0.0), (1.0, 0.0)])
     journal.put(made(40, 10), FRAMES, [(2.0, 0.0)])
@@ -178,15 +178,15 @@ def test_a_file_that_goes_is_noticed_and_begun_anew(tmp_path: Path, monkeypatch:
     assert contents.path == [(0.0, 0.0), (1.0, 0.0), (2.0, 0.0)]
     assert (contents.map_frame, contents.base_frame) == FRAMES
     assert contents.harm == ''
-    # the folder is still this node's alone
+    # the folder still belongs to this node
     with pytest.raises(OutputError, match='another node'):
         Journal(folder, print)
     journal.close()
-    assert len(said) == 1
+    assert len(warnings) == 1
 
 
-def test_a_log_of_another_is_not_deleted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """As where somebody puts a backup in the place of the files; SQLite deletes a log by its name."""
+def test_log_of_another_file_is_not_deleted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """As if a user restores a backup in place of the files; SQLite deletes a log by its name."""
     monkeypatch.setattr(journal_module, 'CHECK_PERIOD', 0.01)
     journal, _ = opened(tmp_path / 'j')
     written(journal, made(0, 10))
@@ -202,12 +202,12 @@ def test_a_log_of_another_is_not_deleted(tmp_path: Path, monkeypatch: pytest.Mon
     assert numbers(tmp_path / 'j' / 'drive_0002.journal')[0] == list(range(20))
 
 
-# a disk that is full, slow, or out of order
+# full, slow and faulty disks
 
 
 @contextlib.contextmanager
 def no_room(journal: Journal) -> Iterator[None]:
-    """Let SQLite find the disk full, by a bound on the pages of the file."""
+    """Make SQLite find the disk full, by a limit on the pages of the file."""
     database = journal._writer._database
     assert database is not None
     pages = database.execute('PRAGMA page_count').fetchone()[0]
@@ -216,18 +216,18 @@ def no_room(journal: Journal) -> Iterator[None]:
     database.execute('PRAGMA max_page_count=1073741823')
 
 
-def test_a_full_disk_is_warned_of_once_and_waited_for(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_full_disk_gives_one_warning_and_readings_wait(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(journal_module, 'RETRY', 0.01)
-    said: list[str] = []
-    journal, _ = opened(tmp_path, said)
+    warnings: list[str] = []
+    journal, _ = opened(tmp_path, warnings)
     written(journal, made(0, 10))
     with no_room(journal):
         for k in range(1, 6):
             journal.put(made(100 * k, 100), FRAMES)
         until(lambda: journal.trouble)
         time.sleep(0.1)
-        assert len(said) == 1
-        assert os.strerror(errno.ENOSPC) in said[0]
+        assert len(warnings) == 1
+        assert os.strerror(errno.ENOSPC) in warnings[0]
         assert journal.unwritten >= 400
     until(lambda: not journal.unwritten)
     assert journal.trouble == ''
@@ -236,18 +236,18 @@ def test_a_full_disk_is_warned_of_once_and_waited_for(tmp_path: Path, monkeypatc
     assert journal.lost == 0
 
 
-def test_what_waits_for_a_disk_is_bounded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_readings_that_wait_for_a_disk_are_bounded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(journal_module, 'RETRY', 0.01)
     monkeypatch.setattr(journal_module, 'MOST_PENDING', 100 * 10 * ROW.itemsize)
-    said: list[str] = []
-    journal, _ = opened(tmp_path, said)
+    warnings: list[str] = []
+    journal, _ = opened(tmp_path, warnings)
     written(journal, made(0, 10, ('sonar 0',)))
     with no_room(journal):
         for k in range(1, 500):
             journal.put(made(10 * k, 10, (f'sonar {k}',)), FRAMES)
         assert journal.unwritten <= 1010
         assert journal.lost >= 4990 - 1010 - 100
-        assert any('lost from now on' in text for text in said)
+        assert any('lost from now on' in text for text in warnings)
     until(lambda: not journal.unwritten)
     written(journal, made(5000, 10, ('sonar 499',)))
     journal.close()
@@ -258,11 +258,11 @@ def test_what_waits_for_a_disk_is_bounded(tmp_path: Path, monkeypatch: pytest.Mo
     assert contents.harm == ''
 
 
-def test_without_a_free_descriptor_nothing_is_written_twice(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_without_a_free_descriptor_readings_are_written_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(journal_module, 'RETRY', 0.01)
     monkeypatch.setattr(syncing, 'PERIOD', 0.01)
-    said: list[str] = []
-    journal, _ = opened(tmp_path, said)
+    warnings: list[str] = []
+    journal, _ = opened(tmp_path, warnings)
     written(journal, made(0, 10))
     soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
     highest = max(map(int, os.listdir('/proc/self/fd')))  # noqa: PTH208 (numbers, not paths)
@@ -270,17 +270,17 @@ def test_without_a_free_descriptor_nothing_is_written_twice(tmp_path: Path, monk
     resource.setrlimit(resource.RLIMIT_NOFILE, (highest + 1, hard))
     try:
         for k in range(1, 50):
-            # also what the thread that syncs had open a moment ago
+            # also the descriptors that the syncing thread had open a moment ago
             with contextlib.suppress(OSError):
                 while True:
                     taken.append(os.dup(0))
             journal.put(made(10 * k, 10), FRAMES)
             time.sleep(0.005)
-        # it needs none to write
+        # writing needs no new descriptor
         until(lambda: not journal.unwritten)
         journal.begin_drive()
         journal.put(made(500, 10), FRAMES)
-        # nor to begin a file more than the last one had
+        # a new file needs no more than the last one had
         until(lambda: not journal.unwritten)
     finally:
         for file in taken:
@@ -288,13 +288,13 @@ def test_without_a_free_descriptor_nothing_is_written_twice(tmp_path: Path, monk
         resource.setrlimit(resource.RLIMIT_NOFILE, (soft, hard))
     until(lambda: not journal.unwritten)
     journal.close()
-    assert any('does not sync written data' in text for text in said)
+    assert any('does not sync written data' in text for text in warnings)
     assert numbers(drives(tmp_path)[0])[0] == list(range(500))
     assert numbers(drives(tmp_path)[1])[0] == list(range(500, 510))
 
 
-def test_a_block_that_is_written_again_is_there_once(tmp_path: Path) -> None:
-    """As after a commit that reached the disk although it reported a failure."""
+def test_block_written_again_is_stored_once(tmp_path: Path) -> None:
+    """As after a commit that reached the disk but reported a failure."""
     journal, _ = opened(tmp_path)
     written(journal, made(0, 10))
     writer = journal._writer
@@ -315,7 +315,7 @@ def test_a_block_that_is_written_again_is_there_once(tmp_path: Path) -> None:
     assert len(contents.path) == 3
 
 
-def test_a_disk_that_is_slow_to_sync_holds_up_no_writing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_slow_sync_does_not_delay_writing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(syncing, 'PERIOD', 0.01)
     began, go_on = threading.Event(), threading.Event()
     sync = os.fdatasync
@@ -337,13 +337,13 @@ def test_a_disk_that_is_slow_to_sync_holds_up_no_writing(tmp_path: Path, monkeyp
     assert numbers(drives(tmp_path)[0])[0] == list(range(20))
     assert not synced
     go_on.set()
-    # what came after it is asked for anew
+    # later data is synced by a new call
     until(lambda: len(synced) >= 2)
     journal.close()
     assert numbers(drives(tmp_path)[1])[0] == list(range(20, 30))
 
 
-def test_a_journal_that_was_closed_too_soon_for_the_disk_lets_go_of_the_folder_later(
+def test_folder_is_released_after_the_last_write_of_a_closed_journal(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     others, write, go_on = {*threading.enumerate()}, DriveWriter.write, threading.Event()
@@ -366,7 +366,7 @@ def test_a_journal_that_was_closed_too_soon_for_the_disk_lets_go_of_the_folder_l
     again.close()
 
 
-def test_a_journal_that_is_closed_while_it_is_read_writes_nothing_any_more(tmp_path: Path) -> None:
+def test_journal_closed_while_it_is_restored_writes_nothing(tmp_path: Path) -> None:
     others = {*threading.enumerate()}
     journal, _ = opened(tmp_path)
     written(journal, made(0, 10))
@@ -384,7 +384,7 @@ def test_a_journal_that_is_closed_while_it_is_read_writes_nothing_any_more(tmp_p
     assert numbers(journal.path)[0] == list(range(10))
 
 
-def test_a_limit_on_the_size_of_files_is_a_full_disk(tmp_path: Path) -> None:
+def test_file_size_limit_is_handled_as_a_full_disk(tmp_path: Path) -> None:
     program = (
         'import resource, signal, sys, time; sys.path.insert(0, sys.argv[2])\n'
         'signal.signal(signal.SIGXFSZ, signal.SIG_IGN)\n'
@@ -409,16 +409,16 @@ def test_a_limit_on_the_size_of_files_is_a_full_disk(tmp_path: Path) -> None:
     assert contents.harm == ''
 
 
-def test_places_where_no_journal_can_be(tmp_path: Path) -> None:
+def test_journal_folder_that_is_a_file_is_rejected(tmp_path: Path) -> None:
     (tmp_path / 'file').write_text('')
     with pytest.raises(OutputError, match='file'):
         Journal(tmp_path / 'file', print)
 
 
-# what a node finds when it starts
+# at the start of a node
 
 
-def test_a_file_that_was_left_half_made_is_made_anew(tmp_path: Path) -> None:
+def test_incomplete_new_journal_is_replaced(tmp_path: Path) -> None:
     for name in ('.new.journal', '.new.journal-journal', '.new.journal-wal'):
         (tmp_path / name).write_bytes(b'SQLite format 3\0' + bytes(1000))
     journal, _ = opened(tmp_path)
@@ -429,7 +429,7 @@ def test_a_file_that_was_left_half_made_is_made_anew(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize('content', ['bytes', 'directory', 'nan', 'cut', 'newer', 'rollback', 'empty'])
-def test_a_damaged_file_is_left_as_it_is_and_its_readings_carried_over(tmp_path: Path, content: str) -> None:
+def test_damaged_journal_stays_and_its_readings_are_copied(tmp_path: Path, content: str) -> None:
     path, expected = tmp_path / 'drive_0007.journal', list(range(1000))
     forged = database(path, [rows(made(10 * k, 10)).tobytes() for k in range(100)], ())
     forged.executemany('INSERT INTO sensors VALUES (?, ?)', [(0, b'left'), (1, b'right')])
@@ -454,8 +454,8 @@ def test_a_damaged_file_is_left_as_it_is_and_its_readings_carried_over(tmp_path:
     if content == 'rollback':
         path.with_name(path.name + '-journal').write_bytes(b'\xd9\xd5\x05\xf9\x20\xa1\x63\xd7' + bytes(600))
     before = path.read_bytes() if path.is_file() else b''
-    said: list[str] = []
-    journal, chunks = opened(tmp_path, said)
+    warnings: list[str] = []
+    journal, chunks = opened(tmp_path, warnings)
     back = [int(x) for readings in chunks for x in readings.x]
     if content == 'cut':
         assert back == expected[: len(back)]
@@ -463,11 +463,11 @@ def test_a_damaged_file_is_left_as_it_is_and_its_readings_carried_over(tmp_path:
     else:
         assert back == expected
     if content == 'rollback':
-        assert not said
+        assert not warnings
     else:
-        assert 'drive_0007.journal' in said[0]
-        assert 'the journal continues in drive_0008.journal' in said[0]
-        assert journal.notice == said[-1]
+        assert 'drive_0007.journal' in warnings[0]
+        assert 'the journal continues in drive_0008.journal' in warnings[0]
+        assert journal.notice == warnings[-1]
     written(journal, made(1000, 10))
     journal.close()
     assert journal.path.name == 'drive_0008.journal'
@@ -475,19 +475,19 @@ def test_a_damaged_file_is_left_as_it_is_and_its_readings_carried_over(tmp_path:
     assert found == [*back, *range(1000, 1010)]
     assert contents.harm == ''
     assert (path.read_bytes() if path.is_file() else b'') == before
-    journal, chunks = opened(tmp_path, said)
+    journal, chunks = opened(tmp_path, warnings)
     assert [int(x) for readings in chunks for x in readings.x] == found
     journal.close()
 
 
-def test_a_journal_of_the_previous_format_goes_on_in_a_new_file(tmp_path: Path) -> None:
+def test_journal_of_the_previous_format_continues_in_a_new_file(tmp_path: Path) -> None:
     old = tmp_path / 'drive_0003.journal'
     old.write_bytes(Previous.file(120_000, 1000))
     before = old.read_bytes()
-    said: list[str] = []
-    journal, chunks = opened(tmp_path, said)
+    warnings: list[str] = []
+    journal, chunks = opened(tmp_path, warnings)
     assert sum(map(len, chunks)) == 120_000
-    assert 'the previous version, which the next version will not read' in said[0]
+    assert 'the previous version, which the next version will not read' in warnings[0]
     assert journal.contents.map_frame == 'odom'
     written(journal, made(120_000, 10))
     journal.close()
@@ -507,8 +507,8 @@ def written_since(path: Path, moment: int) -> bool:
     return path.exists() and path.stat().st_mtime_ns > moment
 
 
-def killed_again_and_again(folder: Path, times: int, seed: int) -> float:
-    """Kill the writer of a journal at random moments; return the most seconds that were ever lost."""
+def killed_repeatedly(folder: Path, times: int, seed: int) -> float:
+    """Kill the writer of a journal at random moments; return the most seconds of readings that were lost."""
     rng = random.Random(seed)
     program = Path(__file__).parent / 'journal_writer.py'
     worst = 0.0
@@ -518,21 +518,21 @@ def killed_again_and_again(folder: Path, times: int, seed: int) -> float:
         process = subprocess.Popen(
             [sys.executable, str(program), str(folder)], stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True
         )
-        # once it writes, or while it starts
+        # while it writes, or while it starts
         if rng.random() < 0.8:
             until(functools.partial(written_since, log, began), 60.0)
         time.sleep(rng.uniform(0.0, 2.0))
         died = time.time_ns()
         process.send_signal(signal.SIGKILL)
-        _, said = process.communicate(timeout=PATIENCE)
-        assert said == ''
+        _, warnings = process.communicate(timeout=PATIENCE)
+        assert warnings == ''
         newest = drive_file(folder)
         if newest is None:
             continue
         contents = Contents()
         found = list(read(newest, contents))
         x = np.concatenate([readings.x for readings in found] or [np.zeros(0)])
-        # none is missing and none is there twice: every run goes on where the last one's journal ended
+        # none is missing or duplicated: each run continues where the journal of the last one ended
         assert np.array_equal(x, np.arange(len(x)))
         assert contents.harm == ''
         for readings in found:
@@ -540,7 +540,7 @@ def killed_again_and_again(folder: Path, times: int, seed: int) -> float:
             expected = np.array(('front', 'hinten links', '超音波'))[readings.x.astype(int) % 3]
             assert (names == expected).all()
         counts, moments = np.fromfile(log, '<i8').reshape(-1, 2).T if log.exists() else np.zeros((2, 0), np.int64)
-        # of this run, since what a run loses the next one accepts anew
+        # only readings of this run, since the next run accepts the lost ones again
         lost = moments[(counts > len(x)) & (moments > began)]
         if len(lost):
             worst = max(worst, (died - int(lost[0])) / 1e9)
@@ -552,12 +552,12 @@ def killed_again_and_again(folder: Path, times: int, seed: int) -> float:
 def test_kill_at_any_moment_loses_less_than_a_second(tmp_path: Path) -> None:
     writers = 2
     with ThreadPoolExecutor(writers) as pool:
-        runs = [pool.submit(killed_again_and_again, tmp_path / f'{k}', KILLS // writers, k) for k in range(writers)]
-    # the writer's part of it is a quarter of a second, as the node's
+        runs = [pool.submit(killed_repeatedly, tmp_path / f'{k}', KILLS // writers, k) for k in range(writers)]
+    # a quarter of a second is due to the writer, as in the node
     assert 0.0 < max(run.result() for run in runs) < 1.0
 
 
-def test_a_pipe_in_the_place_of_a_journal_is_not_waited_for(tmp_path: Path) -> None:
+def test_pipe_in_place_of_a_journal_is_rejected_at_once(tmp_path: Path) -> None:
     os.mkfifo(tmp_path / 'drive_0001.journal')
     with pytest.raises(BagError, match='not a regular file'):
         numbers(tmp_path / 'drive_0001.journal')

@@ -1,4 +1,4 @@
-"""Journals of the previous format: damage costs what it hits, and sound checksums do not make sense of nonsense."""
+"""Journals of the previous format: damage affects only its block, and blocks with valid checksums are validated too."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ def path(tmp_path: Path) -> Path:
     return tmp_path / 'drive_0001.journal'
 
 
-def test_what_the_previous_version_wrote(path: Path) -> None:
+def test_journal_of_the_previous_version_is_read(path: Path) -> None:
     path.write_bytes(Previous.file(200))
     found, contents = numbers(path)
     assert found == list(range(200))
@@ -27,7 +27,7 @@ def test_what_the_previous_version_wrote(path: Path) -> None:
     assert 'the previous version' in contents.note
 
 
-def test_an_end_that_is_torn_anywhere(path: Path) -> None:
+def test_truncated_journal_gives_all_complete_blocks(path: Path) -> None:
     whole = Previous.file(30)
     last = 0
     for length in (*range(8, len(whole), 29), len(whole)):
@@ -42,7 +42,7 @@ def test_an_end_that_is_torn_anywhere(path: Path) -> None:
     assert contents.harm == ''
 
 
-def test_a_flipped_bit_costs_one_block(path: Path) -> None:
+def test_flipped_bit_loses_one_block(path: Path) -> None:
     whole = Previous.file(200)
     rng = random.Random(1)
     for _ in range(200):
@@ -56,7 +56,7 @@ def test_a_flipped_bit_costs_one_block(path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ('block', 'said'),
+    ('block', 'reason'),
     [
         (Previous.block(1, b'{'), 'frames of the drive'),
         (Previous.block(1, b'\xff'), 'frames of the drive'),
@@ -76,18 +76,18 @@ def test_a_flipped_bit_costs_one_block(path: Path) -> None:
         (Previous.block(0, bytes(68)), 'not part of a journal'),
     ],
 )
-def test_sound_checksums_with_bad_content_are_told_in_words(path: Path, block: bytes, said: str) -> None:
+def test_bad_content_with_valid_checksum_is_reported(path: Path, block: bytes, reason: str) -> None:
     whole = Previous.file(20)
     path.write_bytes(whole + block + Previous.readings(rows(made(20, 10))))
     found, contents = numbers(path)
     assert found == list(range(30))
-    assert said in contents.harm
+    assert reason in contents.harm
     assert (contents.map_frame, contents.base_frame) == FRAMES
     assert np.isfinite(contents.path).all()
 
 
-def test_what_costs_time_is_given_up(path: Path) -> None:
-    """Heads that each claim 64 MB, close together, and a hole of a terabyte."""
+def test_reading_of_a_slow_file_is_stopped(path: Path) -> None:
+    """Many headers that each claim 64 MB, and a hole of a terabyte."""
     heads = struct.pack('<4sBxxxII', b'\xf5FGM', 3, 1 << 26, 0) * 100_000
     for tail in (heads, bytes(1 << 20)):
         path.write_bytes(Previous.file(20) + tail)

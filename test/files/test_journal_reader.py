@@ -1,4 +1,4 @@
-"""Journal files that nobody wrote in order: damaged, forged, endless, huge. None may hang, take memory or mislead."""
+"""Damaged, forged, endless and huge journals: reading must not hang, use much memory or return wrong readings."""
 
 from __future__ import annotations
 
@@ -28,11 +28,11 @@ FORGE = 'import sqlite3, sys; d = sqlite3.connect(sys.argv[1]); d.execute(sys.ar
 
 PROGRAM = [sys.executable, str(Path(__file__).parent / 'examine_journal.py')]
 MOST_MB = 150.0
-"""Memory that reading may take, whatever the file holds; a chunk of readings takes some 20."""
+"""Largest memory of a reader for any file; a chunk of readings takes about 20."""
 
 
 def examined(path: Path, seconds: float = 60.0) -> dict[str, Any]:
-    """Read a file in another process; it must end in time, without a traceback, and with little memory."""
+    """Read a file in another process, which must end in time, without a traceback, and with little memory."""
     done = subprocess.run([*PROGRAM, str(path)], capture_output=True, text=True, timeout=seconds, check=False)
     assert done.returncode == 0, done.stderr
     result: dict[str, Any] = json.loads(done.stdout)
@@ -55,7 +55,7 @@ def path(tmp_path: Path) -> Path:
 
 
 @pytest.mark.parametrize(
-    ('column', 'value', 'said'),
+    ('column', 'value', 'message'),
     [
         ('x', np.nan, 'pose'),
         ('y', -np.inf, 'pose'),
@@ -80,8 +80,8 @@ def path(tmp_path: Path) -> Path:
     ],
 )
 @pytest.mark.parametrize('format', ['present', 'previous'])
-def test_readings_that_cannot_be_are_left_out_and_named(
-    path: Path, format: str, column: str, value: float, said: str
+def test_invalid_readings_are_left_out_and_reported(
+    path: Path, format: str, column: str, value: float, message: str
 ) -> None:
     content = rows(made(1, 10))
     content[column][3] = value
@@ -89,7 +89,7 @@ def test_readings_that_cannot_be_are_left_out_and_named(
         names = b''.join((Previous.frames(), Previous.name(0, 'left'), Previous.name(1, 'right')))
         path.write_bytes(Previous.MAGIC + names + Previous.readings(content))
         if column == 'sensor':
-            # a name that was damaged is made up
+            # an unknown name is replaced
             assert len(numbers(path)[0]) == 10
             return
     else:
@@ -98,7 +98,7 @@ def test_readings_that_cannot_be_are_left_out_and_named(
     assert len(found) == 9
     assert set(found) <= set(range(1, 11))
     assert contents.harm.startswith('1 reading is left out, since its ')
-    assert said in contents.harm
+    assert message in contents.harm
 
 
 ENDLESS = 'WITH RECURSIVE n(i) AS (SELECT 0 UNION ALL SELECT i + 1 FROM n)'
@@ -126,7 +126,7 @@ BLOCK = made(0, 10)
         [f"CREATE TABLE more (t TEXT DEFAULT '{'a' * 900_000}')"],
     ],
 )
-def test_a_database_with_other_tables_is_refused(path: Path, tmp_path: Path, sql: list[str]) -> None:
+def test_database_with_other_tables_is_rejected(path: Path, tmp_path: Path, sql: list[str]) -> None:
     forged = database(path, [rows(BLOCK).tobytes()])
     try:
         for statement in sql:
@@ -137,21 +137,21 @@ def test_a_database_with_other_tables_is_refused(path: Path, tmp_path: Path, sql
         forged.close()
     result = examined(path) if ENDLESS in sql[-1] else quickly(path)
     assert 'has other tables than a journal' in result['error'] or 'too big' in result['error']
-    # the node leaves it as it is, and maps on
+    # the node does not change it and continues to map
     before = path.read_bytes()
-    said: list[str] = []
-    journal, found = opened(tmp_path, said)
+    warnings: list[str] = []
+    journal, found = opened(tmp_path, warnings)
     assert found == []
     written(journal, made(0, 10))
     journal.close()
     assert journal.path.name == 'drive_0002.journal'
     assert path.read_bytes() == before
-    assert 'the journal continues in drive_0002.journal' in said[0]
+    assert 'the journal continues in drive_0002.journal' in warnings[0]
     assert numbers(journal.path)[0] == list(range(10))
 
 
 @pytest.mark.parametrize(
-    ('sql', 'said', 'count'),
+    ('sql', 'message', 'count'),
     [
         ("UPDATE readings SET rows = 'text'", 'contain no readings', 0),
         ('UPDATE readings SET rows = NULL', 'contain no readings', 0),
@@ -184,20 +184,20 @@ def test_a_database_with_other_tables_is_refused(path: Path, tmp_path: Path, sql
         ('PRAGMA application_id=0', 'not a journal', 0),
     ],
 )
-def test_values_that_no_node_wrote(path: Path, sql: str, said: str, count: int) -> None:
+def test_forged_values_are_skipped_or_reported(path: Path, sql: str, message: str, count: int) -> None:
     database(path, [rows(made(0, 10)).tobytes(), rows(made(10, 10)).tobytes()]).close()
-    # in a process of its own: with Python 3.10 a bound on SQLite's memory holds for all of a process
+    # in a separate process: with Python 3.10, a limit on SQLite's memory applies to the whole process
     subprocess.run([sys.executable, '-c', FORGE, str(path), sql], check=True, timeout=60)
-    # those that hold a long value also take little memory
+    # those with a long value also take little memory
     result = examined(path) if path.stat().st_size > 10_000_000 else quickly(path)
-    # a value that is too long is not even loaded by a newer Python's SQLite
-    assert said in result['error'] + result['harm'] or 'too big' in result['error'] + result['harm']
-    assert bool(result['error'] + result['harm']) == bool(said)
+    # newer SQLite does not even load a value that is too long
+    assert message in result['error'] + result['harm'] or 'too big' in result['error'] + result['harm']
+    assert bool(result['error'] + result['harm']) == bool(message)
     assert result['count'] == count
 
 
 @pytest.mark.parametrize('value', ['1' + 400 * '0', '-1' + 400 * '0', '1e999', 'NaN', '"0.5"', '[0.5]', 'null'])
-def test_a_parameter_that_cannot_be_used_does_not_hide_the_others(value: str) -> None:
+def test_invalid_parameter_does_not_hide_the_others(value: str) -> None:
     contents = Contents()
     contents.set_parameters(f'{{"p_hit": {value}, "max_iterations": {value}, "p_rand": 0.25}}'.encode())
     assert contents.parameters == {'p_rand': 0.25}
@@ -215,7 +215,7 @@ def varint(value: int) -> bytes:
 
 
 def page(kind: int, cells: list[bytes], right: int = 0, head: bytes = b'') -> bytes:
-    """Make a page of a table's tree: a leaf (13), or a branch (5) whose last child is `right`."""
+    """Make a page of the tree of a table: a leaf (13), or a branch (5) whose last child is `right`."""
     at, pointers, content = PAGE, b'', b''
     for cell in cells:
         at -= len(cell)
@@ -238,7 +238,7 @@ def root(path: Path, table: str) -> int:
 
 
 def replaced(path: Path, pages: dict[int, bytes]) -> None:
-    """Replace pages of a database, or add some at its end."""
+    """Replace pages of a database, or append pages."""
     content = bytearray(path.read_bytes())
     count = max(len(content) // PAGE, *pages)
     content += bytes(count * PAGE - len(content))
@@ -250,8 +250,8 @@ def replaced(path: Path, pages: dict[int, bytes]) -> None:
 
 
 @pytest.mark.parametrize('leaf', ['rows', 'empty'])
-def test_a_tree_without_end(path: Path, leaf: str) -> None:
-    """Fifteen storeys of branches, each of which has the next one as its child 400 times."""
+def test_reading_of_an_endless_tree_is_stopped(path: Path, leaf: str) -> None:
+    """Fifteen levels of branches, each with the next one as its child 400 times."""
     database(path, [rows(made(0, 10)).tobytes()]).close()
     at = root(path, 'readings')
     content = path.read_bytes()[(at - 1) * PAGE : at * PAGE] if leaf == 'rows' else page(13, [])
@@ -263,8 +263,8 @@ def test_a_tree_without_end(path: Path, leaf: str) -> None:
     assert result['count'] == (10 if leaf == 'rows' else 0)
 
 
-def test_a_schema_without_end(path: Path) -> None:
-    """SQLite reads it before anybody can look at it."""
+def test_reading_of_an_endless_schema_is_stopped(path: Path) -> None:
+    """SQLite reads the schema before any check of ours."""
     forged = database(path)
     forged.execute('CREATE TABLE more (t TEXT UNIQUE)')
     forged.close()
@@ -291,8 +291,8 @@ def test_a_schema_without_end(path: Path) -> None:
     assert result['count'] == 0
 
 
-def test_rows_that_share_their_bytes(path: Path) -> None:
-    """Small cells, all of which go on in the same 680 kB: 50 000 of them would hold 34 GB."""
+def test_rows_that_share_their_bytes_are_bounded(path: Path) -> None:
+    """Small cells that all continue in the same 680 kB: 50 000 of them would be 34 GB."""
     block = rows(made(0, 10_000)).tobytes()
     database(path, [block]).close()
     at = root(path, 'readings')
@@ -313,7 +313,7 @@ def test_rows_that_share_their_bytes(path: Path) -> None:
     assert 10_000 <= result['count'] < 2 * path.stat().st_size // ROW.itemsize
 
 
-def test_a_file_cut_off_anywhere_gives_what_is_left(path: Path, tmp_path: Path) -> None:
+def test_truncated_journal_gives_the_remaining_readings(path: Path, tmp_path: Path) -> None:
     database(path, [rows(made(10 * k, 10)).tobytes() for k in range(60)]).close()
     whole = path.read_bytes()
     lengths = {*range(0, len(whole), 1013), *range(len(whole) - 3, len(whole)), PAGE, 3 * PAGE}
@@ -325,15 +325,15 @@ def test_a_file_cut_off_anywhere_gives_what_is_left(path: Path, tmp_path: Path) 
             assert str(path) in str(error)
             assert length < 8 * PAGE
             continue
-        # what was cut off of a page counts as zeros, which are no readings
+        # missing parts of a page count as zeros, which are no readings
         assert found == sorted(set(found) & set(range(600)))
         assert len(found) > 600 * length / len(whole) - 200
-        # the end of the last page may hold nothing
+        # the end of the last page may be empty
         assert contents.harm or len(found) == 600
 
 
-def test_bytes_that_were_changed(path: Path) -> None:
-    """Anything may be read or refused, but only numbers that can be readings, never without a word."""
+def test_changed_bytes_give_valid_readings_or_a_message(path: Path) -> None:
+    """Any result is allowed, but all readings must be valid, and lost ones must be reported."""
     database(path, [rows(made(10 * k, 10)).tobytes() for k in range(30)]).close()
     whole = path.read_bytes()
     rng = random.Random(1)
@@ -351,7 +351,7 @@ def test_bytes_that_were_changed(path: Path) -> None:
         assert len(found) == 300 or contents.harm
 
 
-def test_random_bytes_are_no_readings(path: Path) -> None:
+def test_random_bytes_are_rejected(path: Path) -> None:
     database(path, [rows(made(0, 10)).tobytes()]).close()
     head = path.read_bytes()[:100]
     rng = random.Random(2)
@@ -361,7 +361,7 @@ def test_random_bytes_are_no_readings(path: Path) -> None:
             numbers(path)
 
 
-def test_files_that_are_none(path: Path, tmp_path: Path) -> None:
+def test_pipes_folders_and_other_databases_are_no_journals(path: Path, tmp_path: Path) -> None:
     os.mkfifo(path)
     with pytest.raises(BagError, match='not a regular file'):
         numbers(path)
@@ -375,8 +375,8 @@ def test_files_that_are_none(path: Path, tmp_path: Path) -> None:
     os.mkfifo(log_of(path))
     with pytest.raises(BagError, match='not a regular file'):
         numbers(path)
-    said: list[str] = []
-    journal, found = opened(tmp_path, said)
+    warnings: list[str] = []
+    journal, found = opened(tmp_path, warnings)
     assert found == []
     assert journal.path.name == 'drive_0002.journal'
     journal.close()
@@ -387,19 +387,19 @@ def test_files_that_are_none(path: Path, tmp_path: Path) -> None:
         assert drive_file(tmp_path / name) is None
 
 
-def test_a_hole_of_a_terabyte(path: Path) -> None:
+def test_journal_with_a_hole_of_a_terabyte_is_read(path: Path) -> None:
     database(path, [rows(made(0, 10)).tobytes()]).close()
     with path.open('r+b') as file:
         file.truncate(1 << 40)
     assert examined(path)['count'] == 10
-    # beside a log it is copied, without the hole
+    # with a log it is copied, without the hole
     with log_of(path).open('wb') as log:
         log.truncate(1 << 40)
     assert examined(path)['count'] in (0, 10)
 
 
 def killed(tmp_path: Path, blocks: int) -> Path:
-    """Return a file whose log was never moved into it, as a kill leaves it."""
+    """Return a file whose log was not yet moved into it, as after a kill."""
     journal, _ = opened(tmp_path / 'alive')
     for k in range(blocks):
         written(journal, made(10 * k, 10))
@@ -411,7 +411,7 @@ def killed(tmp_path: Path, blocks: int) -> Path:
     return folder / 'drive_0001.journal'
 
 
-def test_a_log_cut_off_anywhere_gives_whole_blocks(tmp_path: Path) -> None:
+def test_truncated_log_gives_complete_blocks(tmp_path: Path) -> None:
     path = killed(tmp_path, 12)
     whole = log_of(path).read_bytes()
     rng = random.Random(3)
@@ -434,8 +434,8 @@ def test_a_log_cut_off_anywhere_gives_whole_blocks(tmp_path: Path) -> None:
         assert found == list(range(len(found)))
 
 
-def test_reading_while_it_is_written(tmp_path: Path) -> None:
-    """With the log moved into the file now and then, and begun anew."""
+def test_journal_is_read_while_it_is_written(tmp_path: Path) -> None:
+    """The log is moved into the file at times, and a new one begins."""
     journal, _ = opened(tmp_path)
     stop = threading.Event()
     count = [0]
@@ -466,8 +466,8 @@ def test_reading_while_it_is_written(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize('format', ['present', 'with a log', 'previous'])
-def test_a_file_that_is_cut_off_while_it_is_read(tmp_path: Path, format: str) -> None:
-    """A file that is mapped into memory would end the reader with a signal."""
+def test_journal_truncated_while_it_is_read_is_reported(tmp_path: Path, format: str) -> None:
+    """If the file was mapped into memory, the reader would be killed by a signal."""
     path = tmp_path / 'drive_0001.journal'
     if format == 'previous':
         path.write_bytes(Previous.file(200_000, 1000))

@@ -1,4 +1,4 @@
-"""Map files: what map_server, the scoring tool and numpy read back."""
+"""Map files as map_server, the scoring tool and numpy read them."""
 
 from __future__ import annotations
 
@@ -58,7 +58,7 @@ def test_top_row_of_the_image_has_the_largest_y(tmp_path: Path) -> None:
     assert (tmp_path / 'map.pgm').read_bytes() == b'P5\n3 2\n255\n' + bytes([205, 254, 205, 254, 254, 0])
 
 
-def test_yaml_is_what_map_server_wants(tmp_path: Path) -> None:
+def test_yaml_has_the_fields_of_map_server(tmp_path: Path) -> None:
     meta = yaml.safe_load(write_trinary(tmp_path / 'a.b', GRID, CELLS).read_text())
     assert meta == {
         'image': 'a.b.pgm',
@@ -78,7 +78,7 @@ def test_raw_pixels_are_percent(tmp_path: Path) -> None:
     assert (tmp_path / 'map.pgm').read_bytes()[-4:] == bytes([0, 100, 50, 255])
 
 
-def test_thresholds_keep_the_three_kinds_apart() -> None:
+def test_thresholds_separate_occupied_unknown_and_free() -> None:
     occupied, unknown, free = ((255 - v) / 255 for v in (0, 205, 254))
     assert occupied > 0.65
     assert 0.196 <= unknown <= 0.65
@@ -110,7 +110,7 @@ def test_raw_round_trip(tmp_path: Path, probability: np.ndarray) -> None:
     np.testing.assert_allclose(read, probability, atol=0.00501)
 
 
-def test_scoring_tool_reads_the_same(tmp_path: Path) -> None:
+def test_scoring_tool_reads_the_same_map(tmp_path: Path) -> None:
     tool = score_map()
     maps = made_maps()
     for file, expected, tolerance in (
@@ -124,7 +124,7 @@ def test_scoring_tool_reads_the_same(tmp_path: Path) -> None:
         np.testing.assert_allclose(read_map(file)[1], probability, atol=1e-6)
 
 
-def test_scale_and_negate(tmp_path: Path) -> None:
+def test_images_with_scale_and_negate_are_read(tmp_path: Path) -> None:
     (tmp_path / 'map.pgm').write_text('P2 # plain\n# by hand\n4 1\n100\n0 25 50\n100 # last\n')
     meta: dict[str, Any] = {
         'image': 'map.pgm',
@@ -153,7 +153,7 @@ def test_scale_and_negate(tmp_path: Path) -> None:
         ({'origin': [0.013, 0, 0]}, 'not a multiple'),
     ],
 )
-def test_maps_that_cannot_be_read(tmp_path: Path, change: dict[str, Any], message: str) -> None:
+def test_unsupported_map_is_rejected_with_reason(tmp_path: Path, change: dict[str, Any], message: str) -> None:
     file = write_trinary(tmp_path / 'map', GRID, CELLS)
     file.write_text(yaml.safe_dump(yaml.safe_load(file.read_text()) | change))
     with pytest.raises(InputError, match=message):
@@ -161,21 +161,21 @@ def test_maps_that_cannot_be_read(tmp_path: Path, change: dict[str, Any], messag
 
 
 @pytest.mark.parametrize('text', ['', '[1, 2]', 'image: x', ': : :', 'just words'])
-def test_yaml_of_something_else(tmp_path: Path, text: str) -> None:
+def test_yaml_without_a_map_is_rejected(tmp_path: Path, text: str) -> None:
     (tmp_path / 'map.yaml').write_text(text)
     with pytest.raises(InputError, match='not the YAML of a map'):
         read_map(tmp_path / 'map.yaml')
 
 
 @pytest.mark.parametrize('content', [b'P5\n3 2\n255\n\x00', b'P2\n3 2\n255\n1 2', b'P2\n3 2\n255\n1 2 3 4 x 6'])
-def test_image_that_is_cut_short(tmp_path: Path, content: bytes) -> None:
+def test_truncated_image_is_rejected(tmp_path: Path, content: bytes) -> None:
     file = write_trinary(tmp_path / 'map', GRID, CELLS)
     (tmp_path / 'map.pgm').write_bytes(content)
     with pytest.raises(InputError, match='damaged or cut short'):
         read_map(file)
 
 
-def test_writing_that_fails(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_errors_of_writing_are_reported(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / 'file').write_text('')
     with pytest.raises(OutputError, match='not a folder'):
         write_trinary(tmp_path / 'file' / 'map', GRID, CELLS)
@@ -254,7 +254,7 @@ def test_npz_is_plain_numpy(tmp_path: Path) -> None:
         assert json.loads(str(data['parameters']))['p_hit'] == Parameters().model.p_hit
 
 
-def test_npz_of_something_else(tmp_path: Path) -> None:
+def test_file_that_is_no_archive_of_maps_is_rejected(tmp_path: Path) -> None:
     with pytest.raises(InputError, match='does not exist'):
         read_npz(tmp_path / 'absent.npz')
     np.savez(tmp_path / 'other.npz', a=1)
@@ -267,7 +267,7 @@ def test_npz_of_something_else(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize('shape', [(1, 1), (7, 5), (300, 40)])
-def test_image_viewers_show_probability_maps(tmp_path: Path, shape: tuple[int, int]) -> None:
+def test_pixels_of_probability_maps_are_shown_by_image_viewers(tmp_path: Path, shape: tuple[int, int]) -> None:
     image = pytest.importorskip('PIL.Image')
     probability = np.random.default_rng(shape[0]).uniform(0, 1, shape).astype(np.float32)
     probability[0, 0] = np.nan

@@ -1,4 +1,4 @@
-"""Folders that appear whole or not at all."""
+"""Output folders that appear complete or not at all."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from forward_grid_mapper.core.common.errors import OutputError
 from forward_grid_mapper.files.output_folder import distinguished, free_name, output_errors, output_folder, unwritable
 
 
-def test_paths_are_told_apart_by_their_ends() -> None:
+def test_paths_are_shortened_to_distinct_ends() -> None:
     assert distinguished(['/a/monday/bag', '/a/tuesday/bag', 'other']) == ['monday/bag', 'tuesday/bag', 'other']
     assert distinguished(['/a/x/bag', '/b/x/bag']) == ['a/x/bag', 'b/x/bag']
     assert distinguished(['bag', '/b/bag', 'bag', '', '/']) == ['bag', 'b/bag', 'bag', '.', '/']
@@ -31,19 +31,19 @@ def fill(path: Path) -> None:
 
 
 @pytest.mark.parametrize('name', ['maps', 'maps.v2', 'runs/today/maps'])
-def test_appears_when_done(tmp_path: Path, name: str) -> None:
+def test_folder_appears_when_complete(tmp_path: Path, name: str) -> None:
     fill(tmp_path / name)
     assert names_in(tmp_path / name) == ['a.txt', 'sub']
     assert len(list(tmp_path.iterdir())) == 1
 
 
-def test_has_ordinary_permissions(tmp_path: Path) -> None:
+def test_folder_has_default_permissions(tmp_path: Path) -> None:
     (tmp_path / 'plain').mkdir()
     fill(tmp_path / 'maps')
     assert (tmp_path / 'maps').stat().st_mode == (tmp_path / 'plain').stat().st_mode
 
 
-def test_fills_an_empty_folder_in_place(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_existing_empty_folder_is_filled(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     inode = tmp_path.stat().st_ino
     monkeypatch.chdir(tmp_path)
     fill(Path())
@@ -51,14 +51,14 @@ def test_fills_an_empty_folder_in_place(tmp_path: Path, monkeypatch: pytest.Monk
     assert tmp_path.stat().st_ino == inode
 
 
-def test_refuses_a_folder_with_something_in_it(tmp_path: Path) -> None:
+def test_folder_that_is_not_empty_is_rejected(tmp_path: Path) -> None:
     (tmp_path / 'mine.txt').write_text('mine')
     with pytest.raises(OutputError, match='choose another folder with -o'):
         fill(tmp_path)
     assert names_in(tmp_path) == ['mine.txt']
 
 
-def test_refuses_a_file(tmp_path: Path) -> None:
+def test_file_in_place_of_the_folder_is_rejected(tmp_path: Path) -> None:
     (tmp_path / 'maps').write_text('mine')
     with pytest.raises(OutputError, match='is a file'):
         fill(tmp_path / 'maps')
@@ -66,7 +66,7 @@ def test_refuses_a_file(tmp_path: Path) -> None:
         fill(tmp_path / 'maps' / 'inner')
 
 
-def test_refuses_a_folder_that_came_up_meanwhile(tmp_path: Path) -> None:
+def test_folder_created_meanwhile_is_rejected(tmp_path: Path) -> None:
     with pytest.raises(OutputError, match='has been created meanwhile'), output_folder(tmp_path / 'maps') as folder:
         (folder / 'a.txt').write_text('a')
         (tmp_path / 'maps').mkdir()
@@ -77,7 +77,7 @@ def test_refuses_a_folder_that_came_up_meanwhile(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize('failure', [RuntimeError, KeyboardInterrupt, FileNotFoundError])
 @pytest.mark.parametrize('exists', [False, True])
-def test_nothing_stays_after_a_failure(tmp_path: Path, failure: type[BaseException], exists: bool) -> None:
+def test_failure_leaves_no_files(tmp_path: Path, failure: type[BaseException], exists: bool) -> None:
     target = tmp_path / 'maps' if exists else tmp_path / 'new' / 'maps'
     if exists:
         target.mkdir()
@@ -88,13 +88,13 @@ def test_nothing_stays_after_a_failure(tmp_path: Path, failure: type[BaseExcepti
     assert not exists or not names_in(target)
 
 
-def test_a_full_disk_is_reported(tmp_path: Path) -> None:
+def test_full_disk_is_reported(tmp_path: Path) -> None:
     with pytest.raises(OutputError, match='disk is full'), output_folder(tmp_path / 'maps'):
         raise OSError(errno.ENOSPC, 'No space left on device')
     assert not list(tmp_path.iterdir())
 
 
-def test_a_forbidden_parent_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_parent_without_permission_is_reported(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def refuse(self: Path, *args: object, **kwargs: object) -> None:
         raise PermissionError(errno.EACCES, 'Permission denied')
 
@@ -104,14 +104,14 @@ def test_a_forbidden_parent_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPa
 
 
 @pytest.mark.skipif(os.geteuid() == 0, reason='permissions do not bind root')
-def test_a_forbidden_parent_is_told_for_real(tmp_path: Path) -> None:
+def test_parent_without_write_mode_is_reported(tmp_path: Path) -> None:
     tmp_path.chmod(0o500)
     with pytest.raises(OutputError, match='no permission'):
         fill(tmp_path / 'maps')
     tmp_path.chmod(0o700)
 
 
-def test_a_folder_that_cannot_be_written_is_known_before(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_unwritable_folder_is_detected_in_advance(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / 'file').touch()
     assert unwritable(tmp_path) == unwritable(tmp_path / 'new' / 'newer') == ''
     assert 'there is no user' in unwritable('~nobody_of_this_name/maps')

@@ -1,4 +1,4 @@
-"""Parameters from files and command lines, and back."""
+"""Parameters in files and on command lines."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ def load(tmp_path: Path, text: str) -> ParameterFile:
 
 @settings(suppress_health_check=[HealthCheck.function_scoped_fixture], deadline=None)
 @given(values=all_values)
-def test_dump_round_trip(tmp_path: Path, values: dict[str, Any]) -> None:
+def test_dumped_parameters_are_read_back(tmp_path: Path, values: dict[str, Any]) -> None:
     parameters = Parameters.from_flat(values)
     read = load(tmp_path, dump_parameters(parameters))
     assert Parameters.from_flat(read.values) == parameters
@@ -61,7 +61,7 @@ def test_dump_is_commented_and_plain_yaml() -> None:
     }
 
 
-def test_markdown_has_a_row_for_each() -> None:
+def test_markdown_has_a_row_for_each_parameter() -> None:
     text = parameters_markdown()
     rows = [line for line in text.splitlines() if line.startswith('| `')]
     assert len(rows) == len(TABLE) + len(CONSTANTS)
@@ -84,22 +84,22 @@ def test_markdown_has_a_row_for_each() -> None:
         '      sensors: {base/left: {1.pose: [0, 0.5, 0.1]}}',
     ],
 )
-def test_forms_of_a_file(tmp_path: Path, text: str) -> None:
+def test_all_forms_of_a_parameter_file_are_read(tmp_path: Path, text: str) -> None:
     assert load(tmp_path, text) == ParameterFile(
         {'p_hit': 0.3, 'range_topics': ('a', 'b')}, {'base/left.1': Pose2(0.0, 0.5, 0.1)}, {}
     )
 
 
-@pytest.mark.parametrize(('pose', 'told'), [('[0, 0.5, 1]', 1), ('[0, 1, 1]', 0), ('[0.0, 0.5, 1e-1]', 0)])
-def test_lists_that_ros_refuses_are_warned_of(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture, pose: str, told: int
+@pytest.mark.parametrize(('pose', 'count'), [('[0, 0.5, 1]', 1), ('[0, 1, 1]', 0), ('[0.0, 0.5, 1e-1]', 0)])
+def test_list_that_ros_rejects_gives_a_warning(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture, pose: str, count: int
 ) -> None:
     assert load(tmp_path, f'sensors.a.pose: {pose}').extrinsics['a'].x == 0.0
-    told_of = ['each number of [0, 0.5, 1] with a decimal point' in message for message in caplog.messages]
-    assert told_of == [True] * told
+    warned = ['each number of [0, 0.5, 1] with a decimal point' in message for message in caplog.messages]
+    assert warned == [True] * count
 
 
-def test_parameters_of_another_node_are_warned_of(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+def test_parameters_of_another_node_give_a_warning(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     assert load(tmp_path, 'slam_toolbox: {ros__parameters: {resolution: 0.05}}').values == {'resolution': 0.05}
     assert caplog.messages == [
         'parameters of slam_toolbox are used, which a node with the name forward_grid_mapper does not read'
@@ -107,30 +107,30 @@ def test_parameters_of_another_node_are_warned_of(tmp_path: Path, caplog: pytest
 
 
 @pytest.mark.parametrize('text', ['', '# nothing', '/**:\n  ros__parameters:\n', '{}'])
-def test_files_without_values(tmp_path: Path, text: str) -> None:
+def test_file_without_values_is_read(tmp_path: Path, text: str) -> None:
     assert load(tmp_path, text) == ParameterFile({}, {}, {})
 
 
-def test_the_specific_section_wins(tmp_path: Path) -> None:
+def test_section_of_the_node_overrides_that_of_all_nodes(tmp_path: Path) -> None:
     own = 'forward_grid_mapper: {ros__parameters: {p_hit: 0.5}}\n'
     common = '/**: {ros__parameters: {p_hit: 0.3, use_sim_time: true}}\n'
     for text in (own + common, common + own):
         assert load(tmp_path, text) == ParameterFile({'p_hit': 0.5}, {}, {'use_sim_time': True})
 
 
-def test_the_specific_section_wins_for_a_frame_with_a_slash(tmp_path: Path) -> None:
+def test_section_of_the_node_wins_for_a_frame_with_a_slash(tmp_path: Path) -> None:
     own = 'forward_grid_mapper: {ros__parameters: {sensors./a.pose: [0.5, 0.0, 0.0]}}\n'
     common = '/**: {ros__parameters: {sensors.a.pose: [0.1, 0.0, 0.0], sensors.b.pose: [0.2, 0.0, 0.0]}}\n'
     assert load(tmp_path, own + common).extrinsics == {'/a': (0.5, 0.0, 0.0), 'b': (0.2, 0.0, 0.0)}
 
 
-def test_a_section_of_all_nodes_goes_with_one_in_a_namespace(tmp_path: Path) -> None:
+def test_section_of_all_nodes_applies_in_a_namespace(tmp_path: Path) -> None:
     common = '/**: {ros__parameters: {p_hit: 0.3, p_rand: 0.2}}\nother:\n'
     own = '/r1: {forward_grid_mapper: {ros__parameters: {p_hit: 0.5}}}'
     assert load(tmp_path, common + own).values == {'p_hit': 0.5, 'p_rand': 0.2}
 
 
-def test_parameters_of_ros_itself_pass(tmp_path: Path) -> None:
+def test_parameters_of_ros_are_accepted(tmp_path: Path) -> None:
     assert load(tmp_path, 'qos_overrides: {/odom: {subscription: {depth: 5}}}').node == {
         'qos_overrides./odom.subscription.depth': 5
     }
@@ -181,13 +181,13 @@ def test_parameters_of_ros_itself_pass(tmp_path: Path) -> None:
         ('p_hit: !!python/object/apply:os.getcwd []', 'not valid YAML'),
     ],
 )
-def test_bad_files_are_named(tmp_path: Path, text: str, message: str) -> None:
+def test_bad_parameter_file_is_rejected_with_reason(tmp_path: Path, text: str, message: str) -> None:
     with pytest.raises(ParameterError, match=message) as caught:
         load(tmp_path, text)
     assert str(tmp_path / 'p.yaml') in str(caught.value)
 
 
-def test_files_that_cannot_be_read(tmp_path: Path) -> None:
+def test_unreadable_parameter_file_is_rejected(tmp_path: Path) -> None:
     with pytest.raises(ParameterError, match='cannot be read'):
         load_parameters(tmp_path / 'absent.yaml')
     (tmp_path / 'binary').write_bytes(b'\xff\xfe\x00\x81')
@@ -218,12 +218,12 @@ def test_settings_round_trip(values: dict[str, Any]) -> None:
         ('online=maybe', 'not true or false'),
     ],
 )
-def test_bad_settings(text: str, message: str) -> None:
+def test_bad_setting_is_rejected_with_reason(text: str, message: str) -> None:
     with pytest.raises(ParameterError, match=message):
         parse_setting(text)
 
 
-def test_angles_may_be_in_degrees() -> None:
+def test_setting_of_an_angle_in_degrees() -> None:
     assert parse_setting('field_of_view=30deg') == ('field_of_view', pytest.approx(math.pi / 6))
     assert parse_setting('field_of_view = 30 deg') == ('field_of_view', pytest.approx(math.pi / 6))
 
@@ -236,7 +236,7 @@ def test_angles_may_be_in_degrees() -> None:
         ('a=b=0,0,-90deg', ('a=b', Pose2(0.0, 0.0, -math.pi / 2))),
     ],
 )
-def test_sensors(text: str, expected: tuple[str, Pose2]) -> None:
+def test_sensor_pose_is_parsed(text: str, expected: tuple[str, Pose2]) -> None:
     assert parse_sensor(text) == expected
 
 
@@ -244,7 +244,7 @@ def test_sensors(text: str, expected: tuple[str, Pose2]) -> None:
     'text',
     ['left', '=1,2,3', 'left=1,2', 'left=1,2,3,4', 'left=1,2,inf', 'left=a,b,c', 'left=', 'left=1,2,90degrees'],
 )
-def test_bad_sensors(text: str) -> None:
+def test_bad_sensor_pose_is_rejected(text: str) -> None:
     with pytest.raises(ParameterError, match='form frame=x,y,yaw'):
         parse_sensor(text)
 
@@ -258,14 +258,12 @@ def test_bad_sensors(text: str) -> None:
         ('left=15,12,90deg', 'x and y are in metres'),
     ],
 )
-def test_sensors_in_other_units(text: str, message: str) -> None:
+def test_sensor_pose_in_other_units_is_rejected(text: str, message: str) -> None:
     with pytest.raises(ParameterError, match=message):
         parse_sensor(text)
 
 
-def test_names_of_the_version_before_are_accepted_with_a_warning(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_removed_parameters_are_ignored_with_a_warning(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     file = tmp_path / 'old.yaml'
     file.write_text('bridges: 10\nend_cost: 2.0\nshift_moves: true\ncell_distance: center\n')
     values = {**load_parameters(file).values, **dict([parse_setting('driven_cost=20')])}

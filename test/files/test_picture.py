@@ -1,4 +1,4 @@
-"""The picture: what it shows, and that it never stops a run."""
+"""The picture of a run, which never stops the run."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ PNG = b'\x89PNG\r\n\x1a\n'
 
 @pytest.mark.parametrize(('width', 'height'), [(40, 30), (300, 40), (20, 150), (8, 8)])
 @pytest.mark.parametrize('with_reference', [False, True])
-def test_shapes_of_maps(tmp_path: Path, width: int, height: int, with_reference: bool) -> None:
+def test_picture_of_maps_of_any_shape_is_written(tmp_path: Path, width: int, height: int, with_reference: bool) -> None:
     pytest.importorskip('matplotlib')
     maps = made_maps(width, height)
     reference = (Grid(0.05, -5, -5, 30, 20), np.ones((20, 30), np.int8)) if with_reference else None
@@ -31,7 +31,7 @@ def test_shapes_of_maps(tmp_path: Path, width: int, height: int, with_reference:
     assert (tmp_path / 'maps.png').read_bytes().startswith(PNG)
 
 
-def test_letters_that_the_font_lacks_are_no_matter(tmp_path: Path) -> None:
+def test_picture_with_letters_that_the_font_lacks_is_written(tmp_path: Path) -> None:
     pytest.importorskip('matplotlib')
     paths = np.array([[-1.0, 0.0], [1.0, 0.0], [np.nan, np.nan], [-1.0, 1.0], [1.0, 1.0]])
     with warnings.catch_warnings():
@@ -41,14 +41,14 @@ def test_letters_that_the_font_lacks_are_no_matter(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize('path', [np.empty((0, 2)), np.zeros((1, 2)), np.full((3, 2), np.nan), np.ones((5, 2))])
-def test_odd_paths(tmp_path: Path, path: np.ndarray) -> None:
+def test_picture_with_an_empty_or_unusual_path_is_written(tmp_path: Path, path: np.ndarray) -> None:
     pytest.importorskip('matplotlib')
     write_picture(tmp_path / 'maps.png', made_maps(readings=0), path, 'no readings')
     assert (tmp_path / 'maps.png').read_bytes().startswith(PNG)
 
 
 @pytest.mark.parametrize('count', [1, 2, 40])
-def test_each_drive_has_its_colour(tmp_path: Path, count: int) -> None:
+def test_each_drive_has_its_own_colour(tmp_path: Path, count: int) -> None:
     pytest.importorskip('matplotlib')
     image = pytest.importorskip('PIL.Image')
     y = np.linspace(-1, 1, count)
@@ -63,14 +63,14 @@ def test_each_drive_has_its_colour(tmp_path: Path, count: int) -> None:
         assert (tuple(bytes.fromhex(colour[1:])) in seen) == (k < count), colour
 
 
-def test_pyplot_stays_out(tmp_path: Path) -> None:
+def test_pyplot_is_not_imported(tmp_path: Path) -> None:
     pytest.importorskip('matplotlib')
     sys.modules.pop('matplotlib.pyplot', None)
     write_picture(tmp_path / 'maps.png', made_maps(), PATH, 'run')
     assert 'matplotlib.pyplot' not in sys.modules
 
 
-def test_view_is_cropped_to_what_is_known() -> None:
+def test_view_is_cropped_to_known_cells() -> None:
     maps = made_maps()
     maps.ml[:], maps.live[:] = -1, np.nan
     maps.ml[10, 5], maps.live[12, 9] = 1, 0.4
@@ -83,7 +83,7 @@ def test_view_is_cropped_to_what_is_known() -> None:
     )
 
 
-def test_walls_survive_in_coarse_pictures() -> None:
+def test_walls_are_kept_in_coarse_pictures() -> None:
     maps = made_maps(6001, 11)
     picture = compose(maps, np.empty((0, 2)), '', None)
     values = picture.panels[1].values
@@ -91,8 +91,8 @@ def test_walls_survive_in_coarse_pictures() -> None:
     assert (np.fmax.reduce(values, axis=0)[3:-3] == 1).all()
 
 
-def test_walls_of_fine_maps_are_seen_in_the_picture(tmp_path: Path) -> None:
-    """Walls of one cell of 2 cm in a map of 20 m: each stays black, wherever it falls between the pixels."""
+def test_walls_of_fine_maps_are_black_in_the_picture(tmp_path: Path) -> None:
+    """Walls of one cell of 2 cm in a map of 20 m: each is black, also between two pixels."""
     image = pytest.importorskip('PIL.Image')
     maps = made_maps(1000, 1000, readings=0)
     maps.ml[3:-3, 3:-3] = 0
@@ -101,7 +101,7 @@ def test_walls_of_fine_maps_are_seen_in_the_picture(tmp_path: Path) -> None:
     write_picture(tmp_path / 'maps.png', fine, np.empty((0, 2)), 'fine')
     pixels = np.asarray(image.open(tmp_path / 'maps.png').convert('L'))
     height, width = pixels.shape
-    # the middle panel, off its edges and its scale
+    # the middle panel, without its edges and its scale
     row = pixels[height // 2, round(0.38 * width) : round(0.63 * width)]
     dark = np.flatnonzero(np.diff((row < 60).astype(int)) == 1)
     assert len(dark) == len(range(101, 1000, 131))
@@ -127,9 +127,7 @@ def test_unexplained_readings_end_on_their_axis() -> None:
     assert len(ends) == 6
 
 
-def test_the_picture_does_not_depend_on_how_many_dots_are_drawn_at_once(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_picture_does_not_depend_on_the_number_of_dots_at_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     pytest.importorskip('matplotlib')
     from forward_grid_mapper.files import drawing
 
@@ -141,7 +139,7 @@ def test_the_picture_does_not_depend_on_how_many_dots_are_drawn_at_once(
     assert (tmp_path / 'all.png').read_bytes() == (tmp_path / 'few.png').read_bytes()
 
 
-def test_a_thinned_path_leaves_no_pixel_out_and_ends_where_it_did() -> None:
+def test_thinned_path_covers_the_same_pixels_and_ends() -> None:
     pytest.importorskip('matplotlib')
     from forward_grid_mapper.files.drawing import _thinned
 
@@ -165,7 +163,7 @@ def test_matplotlib_is_optional(tmp_path: Path, monkeypatch: pytest.MonkeyPatch)
         write_picture(tmp_path / 'maps.png', made_maps(), PATH, 'run')
 
 
-def test_a_folder_that_is_absent(tmp_path: Path) -> None:
+def test_picture_in_an_absent_folder_is_reported(tmp_path: Path) -> None:
     pytest.importorskip('matplotlib')
     with pytest.raises(OutputError, match='cannot be written'):
         write_picture(tmp_path / 'absent' / 'maps.png', made_maps(), PATH, 'run')

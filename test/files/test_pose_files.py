@@ -1,4 +1,4 @@
-"""Poses from text files: what is taken, and what is wrong with the others."""
+"""Poses from text files, and the reasons why others are rejected."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ HALF = math.sqrt(0.5)
         f'stamp,x,y,qz,qw,qx,qy,yaw\n1.5,2,3,1,0,0,0,0\n2.5,4,5,x,,,,{math.pi / 2}\n',
     ],
 )
-def test_columns_are_found_by_their_names(tmp_path: Path, text: str) -> None:
+def test_columns_are_found_by_name(tmp_path: Path, text: str) -> None:
     file = tmp_path / 'poses.csv'
     file.write_text(text)
     stamps, poses = poses_from_csv(file)
@@ -32,14 +32,14 @@ def test_columns_are_found_by_their_names(tmp_path: Path, text: str) -> None:
     np.testing.assert_allclose(poses, [[2, 3, 0], [4, 5, math.pi / 2]], atol=1e-12)
 
 
-def test_a_header_alone_is_no_pose(tmp_path: Path) -> None:
+def test_file_with_only_a_header_has_no_poses(tmp_path: Path) -> None:
     (tmp_path / 'poses.csv').write_text('stamp,x,y,yaw\n')
     stamps, poses = poses_from_csv(tmp_path / 'poses.csv')
     assert (stamps.shape, poses.shape) == ((0,), (0, 3))
 
 
 @pytest.mark.parametrize(
-    ('text', 'said'),
+    ('text', 'reason'),
     [
         ('', 'is empty'),
         ('1.5,2,3,0\n', 'no column stamp or stamp_ns; its first line names 1.5, 2, 3, 0'),
@@ -55,15 +55,15 @@ def test_a_header_alone_is_no_pose(tmp_path: Path) -> None:
         (f'stamp,x,y,yaw\n1,2,3,"{"0" * 200_000}"\n', 'is not CSV: field larger than field limit'),
     ],
 )
-def test_what_is_wrong_is_told_with_its_line(tmp_path: Path, text: str, said: str) -> None:
+def test_bad_line_is_rejected_with_its_number(tmp_path: Path, text: str, reason: str) -> None:
     file = tmp_path / 'poses.csv'
     file.write_text(text)
     with pytest.raises(InputError, match='poses') as caught:
         poses_from_csv(file)
-    assert said in str(caught.value)
+    assert reason in str(caught.value)
 
 
-def test_a_file_that_cannot_be_read_is_named(tmp_path: Path) -> None:
+def test_unreadable_file_is_rejected_by_name(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r'absent cannot be read: No such file or directory$'):
         poses_from_csv(tmp_path / 'absent')
     (tmp_path / 'poses.csv').write_bytes(b'\xff\xfe\x00')
@@ -71,7 +71,7 @@ def test_a_file_that_cannot_be_read_is_named(tmp_path: Path) -> None:
         poses_from_csv(tmp_path / 'poses.csv')
 
 
-def test_the_mark_that_spreadsheets_begin_a_file_with_is_no_part_of_a_name(tmp_path: Path) -> None:
+def test_byte_order_mark_is_ignored(tmp_path: Path) -> None:
     file = tmp_path / 'poses.csv'
     file.write_text('stamp,x,y,yaw\n1.5,1,2,0.5\n2.5,2,2,0.5\n', encoding='utf-8-sig')
     stamps, poses = poses_from_csv(file)

@@ -1,4 +1,4 @@
-"""Maps that fit few readings come with a warning."""
+"""Warnings about maps that explain few readings."""
 
 from __future__ import annotations
 
@@ -14,12 +14,12 @@ from forward_grid_mapper.files.results import write_results
 from forward_grid_mapper.simulation.drive import door_drive
 
 
-def test_readings_that_no_map_explains(tmp_path: Path) -> None:
+def test_warning_if_no_map_explains_the_readings(tmp_path: Path) -> None:
     drive = door_drive(2).readings
     maps = Mapper(Parameters()).run(drive)
     assert quality_warning(maps) == ''
     rng = np.random.default_rng(1)
-    # echoes from anywhere, taken from one place
+    # random echoes, all from one place
     wild = dataclasses.replace(drive, x=0 * drive.x, y=0 * drive.y, z=rng.uniform(0.2, 1.0, len(drive)) * drive.z_max)
     wild = Mapper(Parameters()).run(wild)
     warning = quality_warning(wild)
@@ -28,11 +28,13 @@ def test_readings_that_no_map_explains(tmp_path: Path) -> None:
     assert warning in report['warnings']
 
 
-def test_sensors_none_of_which_hears_anything() -> None:
+def test_warning_if_no_reading_has_an_echo() -> None:
     drive = door_drive(1).readings
-    deaf = Mapper(Parameters()).run(dataclasses.replace(drive, z=drive.z_max))
-    assert any(text.startswith(f'none of {len(drive)} readings has an echo') for text in data_warnings(deaf, {}))
+    without_echo = Mapper(Parameters()).run(dataclasses.replace(drive, z=drive.z_max))
+    assert any(
+        text.startswith(f'none of {len(drive)} readings has an echo') for text in data_warnings(without_echo, {})
+    )
     one = drive.z_max.copy()
     one[0] /= 2
-    hears = Mapper(Parameters()).run(dataclasses.replace(drive, z=one))
-    assert not any('has an echo' in text for text in data_warnings(hears, {}))
+    with_echo = Mapper(Parameters()).run(dataclasses.replace(drive, z=one))
+    assert not any('has an echo' in text for text in data_warnings(with_echo, {}))

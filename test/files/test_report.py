@@ -1,4 +1,4 @@
-"""The report, as data and as text."""
+"""The report as data and as text."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ STATISTICS: dict[str, Any] = {
 }
 
 
-def test_data_survives_strict_json() -> None:
+def test_data_is_valid_strict_json() -> None:
     data = report_data(made_maps(statistics=STATISTICS), SOURCE)
     assert json.loads(json.dumps(data, allow_nan=False)) == data
     assert data['input']['note'] is None
@@ -51,7 +51,7 @@ def test_data_survives_strict_json() -> None:
     assert data['statistics']['converged'] is False
 
 
-def test_numbers_come_from_the_maps() -> None:
+def test_numbers_are_those_of_the_maps() -> None:
     data = report_data(made_maps(width=40, height=30, readings=60), SOURCE)
     assert data['map']['free_cells'] == 34 * 24
     assert data['map']['occupied_cells'] == 36 * 26 - 34 * 24
@@ -65,13 +65,13 @@ def test_numbers_come_from_the_maps() -> None:
         assert row['health']['verdict'] == 'ok'
 
 
-def test_the_source_is_not_changed() -> None:
+def test_source_is_not_changed() -> None:
     source = {'counts': {'received': 1}, 'warnings': ['a']}
     report_data(made_maps(), source)
     assert source == {'counts': {'received': 1}, 'warnings': ['a']}
 
 
-def test_text_tells_what_matters() -> None:
+def test_text_has_counts_warnings_and_results() -> None:
     text = report_text(report_data(made_maps(settings={'p_hit': 0.3}, statistics=STATISTICS), SOURCE))
     for part in (
         'WARNINGS (1)',
@@ -94,7 +94,7 @@ def test_text_tells_what_matters() -> None:
     assert all(len(line) <= 100 for line in text.splitlines())
 
 
-def test_a_broken_sensor_is_warned_of_and_in_the_table() -> None:
+def test_broken_sensor_is_in_the_warnings_and_the_table() -> None:
     maps = made_maps(readings=200)
     maps = dataclasses.replace(maps, unexplained=maps.readings.sensor == 1)
     data = report_data(maps, {'warnings': ['first']})
@@ -106,22 +106,22 @@ def test_a_broken_sensor_is_warned_of_and_in_the_table() -> None:
     assert row.split()[1] == '100' and '100.0 %' in row and row.endswith('mostly random')
 
 
-def test_many_random_readings_point_to_drift_unless_a_trajectory_was_looked_for() -> None:
+def test_many_random_readings_give_a_hint_to_refine_poses() -> None:
     maps = made_maps(readings=200)
     hint = 'many, as with odometry that drifts (refine_poses)'
-    for part, source, told in ((50, {}, True), (20, {}, False), (50, {'trajectory': {'refined': False}}, False)):
+    for part, source, expected in ((50, {}, True), (20, {}, False), (50, {'trajectory': {'refined': False}}, False)):
         some = dataclasses.replace(maps, unexplained=np.arange(200) < part)
-        assert (hint in ' '.join(report_text(report_data(some, source)).split())) == told
+        assert (hint in ' '.join(report_text(report_data(some, source)).split())) == expected
 
 
-def test_an_empty_source_is_enough() -> None:
+def test_report_without_source() -> None:
     text = report_text(report_data(made_maps(), {}))
     assert '60 received, 60 accepted (100.0 %)' in text
     assert 'all at their defaults' in text
     assert 'None' not in text and 'WARNINGS' not in text
 
 
-def test_no_readings_and_no_likelihood() -> None:
+def test_report_without_readings_and_likelihood() -> None:
     maps = dataclasses.replace(made_maps(readings=0), log_likelihood=float('nan'), objective=float('-inf'))
     data = report_data(maps, {'counts': {'received': 0, 'rejected': {}}, 'sensors': None, 'stamps': 12})
     assert data['result']['objective'] is None
@@ -129,7 +129,7 @@ def test_no_readings_and_no_likelihood() -> None:
     assert report_text({}).startswith('Sonar maps')
 
 
-def test_files(tmp_path: Path) -> None:
+def test_report_files_are_written(tmp_path: Path) -> None:
     data = report_data(made_maps(), SOURCE)
     write_report(tmp_path, data)
     assert json.loads((tmp_path / 'report.json').read_text(encoding='utf-8')) == data

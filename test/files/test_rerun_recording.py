@@ -1,4 +1,4 @@
-"""The recording for Rerun: read back it is the maps and the readings, it is bounded, and the extra is named."""
+"""The recording for Rerun: it contains the maps and readings, is bounded, and needs an extra."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def drive() -> MapSet:
 
 
 def written(folder: Path, maps: MapSet, path: Any = PATH) -> dict[str, dict[str, list[Any]]]:
-    """What is in the recording of these maps: columns by entity."""
+    """The content of the recording of these maps: columns by entity."""
     rerun = pytest.importorskip('rerun', reason='the extra rerun is not installed')
     from rerun.chunk import RrdReader
 
@@ -53,17 +53,17 @@ def written(folder: Path, maps: MapSet, path: Any = PATH) -> dict[str, dict[str,
 
 
 def column(entity: dict[str, list[Any]], end: str) -> list[Any]:
-    """The rows of the component whose name ends so."""
+    """The rows of the component whose name ends with `end`."""
     (name,) = [name for name in entity if name.endswith(end)]
     return [row for row in entity[name] if row is not None]
 
 
 def grid(entity: dict[str, list[Any]], row: int, shape: tuple[int, int]) -> Any:
-    """A map of an entity as cells, its first row that with the smallest y."""
+    """A map of an entity as cells; the first row has the smallest y."""
     return np.array(column(entity, 'GridMap:data')[row][0], np.uint8).astype(np.int8).reshape(shape)[::-1]
 
 
-def test_it_holds_the_maps(tmp_path: Path) -> None:
+def test_recording_contains_the_maps(tmp_path: Path) -> None:
     maps = drive()
     found = written(tmp_path, maps)
     for name, values in (('maximum_likelihood', maps.ml), ('uncertainty', maps.uncertainty)):
@@ -79,7 +79,7 @@ def test_it_holds_the_maps(tmp_path: Path) -> None:
     assert column(found['/report'], 'text') == [['the report\n']]
 
 
-def test_it_holds_the_readings_by_sensor_and_cause(tmp_path: Path) -> None:
+def test_recording_has_readings_by_sensor_and_cause(tmp_path: Path) -> None:
     maps = drive()
     readings, causes, found = maps.readings, likeliest_causes(maps), written(tmp_path, maps)
     for k, name in enumerate(readings.sensor_names):
@@ -105,7 +105,7 @@ def test_it_holds_the_readings_by_sensor_and_cause(tmp_path: Path) -> None:
                 )
 
 
-def test_maps_far_from_the_origin_are_as_exact(tmp_path: Path) -> None:
+def test_maps_far_from_the_origin_are_exact(tmp_path: Path) -> None:
     far, near = np.array([500_000.0, 5_200_000.0]), corridor_drive(0).readings
     maps = Mapper(Parameters()).run(dataclasses.replace(near, x=near.x + far[0], y=near.y + far[1]))
     found, home = written(tmp_path, maps, path=PATH + far), np.round(maps.grid.origin)
@@ -121,7 +121,7 @@ def test_maps_far_from_the_origin_are_as_exact(tmp_path: Path) -> None:
 
 
 def coordinates(folder: Path, monkeypatch: pytest.MonkeyPatch, shift: Any) -> dict[str, Any]:
-    """What a stand-in for Rerun receives of a short drive that is moved by `shift`: x and y, by kind."""
+    """Data that a stand-in for Rerun receives of a short drive, moved by `shift`: x and y, by kind."""
     rr = MagicMock()
     rr.RecordingStream.return_value.binary_stream.return_value.read.return_value = b'recording'
     monkeypatch.setitem(sys.modules, 'rerun', rr)
@@ -160,7 +160,7 @@ def test_all_coordinates_far_from_the_origin_are_relative_to_the_same_place(
         np.testing.assert_allclose(far[kind], expected + shift - home, atol=1e-3, err_msg=kind)
 
 
-def test_it_is_bounded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_size_of_the_recording_is_bounded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     maps = drive()
     assert len(maps.readings) == 12_000
     written(tmp_path, maps)
@@ -174,7 +174,7 @@ def test_it_is_bounded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.mark.parametrize('readings', [0, 10])
-def test_few_readings_and_odd_names(tmp_path: Path, readings: int) -> None:
+def test_recording_with_few_readings_and_odd_names(tmp_path: Path, readings: int) -> None:
     maps = made_maps(readings=readings)
     odd = dataclasses.replace(maps.readings, sensor_names=('a/b c\n', ''))
     found = written(tmp_path, dataclasses.replace(maps, readings=odd))
@@ -182,13 +182,13 @@ def test_few_readings_and_odd_names(tmp_path: Path, readings: int) -> None:
     assert len(cones) == (2 if readings else 0)
 
 
-def test_without_rerun_the_extra_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_without_rerun_the_message_names_the_extra(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, 'rerun', None)
     with pytest.raises(MapperError, match=r'pip install "forward_grid_mapper\[rerun\]"'):
         write_rerun(tmp_path / 'drive.rrd', made_maps(), '', '')
     assert not list(tmp_path.iterdir())
 
 
-def test_it_is_imported_only_where_it_is_used() -> None:
+def test_rerun_is_imported_only_if_used() -> None:
     program = 'import sys, forward_grid_mapper.commands.process_bag; sys.exit("rerun" in sys.modules)'
     assert subprocess.run([sys.executable, '-c', program], check=False).returncode == 0

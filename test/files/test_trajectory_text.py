@@ -27,13 +27,13 @@ def test_tum_lines_hold_stamp_position_and_quaternion() -> None:
 
 
 @pytest.mark.parametrize('stamp', [-500_000_000, -1_500_000_000, -1, 0, 1, 2_500_000_000])
-def test_stamps_before_zero_are_read_back(tmp_path: Path, stamp: int) -> None:
+def test_negative_stamps_are_read_back(tmp_path: Path, stamp: int) -> None:
     (tmp_path / 'a.tum').write_text(tum_text(Odometry(np.array([stamp]), np.zeros((1, 3)))))
     stamps, _ = poses_from_tum(tmp_path / 'a.tum')
     assert stamps.tolist() == [stamp / 1e9]
 
 
-def test_the_calibration_is_told_in_words() -> None:
+def test_calibration_in_words() -> None:
     words = calibration_words({'scale': 0.012, 'heading': 0.0, 'bias': -math.radians(0.5), 'turn_scale': -0.02})
     assert words == (
         'distances are measured 1.2 % too short; going straight is measured as turning 0.5° a metre to the left; '
@@ -43,7 +43,7 @@ def test_the_calibration_is_told_in_words() -> None:
     assert '1.0° to the right of' in calibration_words({'heading': -math.radians(1.0)})
 
 
-def test_the_report_has_the_calibration_with_its_accuracy() -> None:
+def test_report_has_the_calibration_with_its_accuracy() -> None:
     path = Odometry(np.array([0, 10**9]), np.zeros((2, 3)))
     nothing = Readings.from_columns(x=[], y=[], yaw=[], z=[], z_max=[], half_angle=[])
     outcome = Refinement(True, 'readings are predicted better', nothing, path, {'scale': 0.01})
@@ -52,7 +52,7 @@ def test_the_report_has_the_calibration_with_its_accuracy() -> None:
     assert 'measure a straight line' in ' '.join(report_text({'input': {'trajectory': data}}).split())
 
 
-def test_the_report_says_what_became_of_the_trajectory() -> None:
+def test_report_states_whether_the_trajectory_was_refined() -> None:
     refined = {
         'refined': True,
         'reason': 'readings are predicted better',

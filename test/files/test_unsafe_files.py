@@ -1,4 +1,4 @@
-"""Files that would run code of strangers if they were read carelessly; none of it runs."""
+"""Files that contain code: the code never runs."""
 
 from __future__ import annotations
 
@@ -24,11 +24,11 @@ TAGS = [
     '!!python/tuple [0.0, 0.0, 0.0]',
     '!!python/complex 1.0',
 ]
-"""What PyYAML's unsafe and full loaders know, and its safe loader does not."""
+"""Tags that PyYAML's unsafe and full loaders accept, and its safe loader does not."""
 
 
 @pytest.mark.parametrize('tag', TAGS)
-def test_maps_are_read_by_the_safe_loader(tmp_path: Path, tag: str) -> None:
+def test_code_in_the_yaml_of_a_map_is_rejected(tmp_path: Path, tag: str) -> None:
     path = write_trinary(tmp_path / 'map', Grid(0.1, 0, 0, 3, 2), np.zeros((2, 3), np.int8))
     read_map(path)
     marker = tmp_path / 'marker'
@@ -38,7 +38,7 @@ def test_maps_are_read_by_the_safe_loader(tmp_path: Path, tag: str) -> None:
     assert not marker.exists()
 
 
-def test_no_tuple_passes_for_the_origin_of_a_map(tmp_path: Path) -> None:
+def test_python_tuple_as_origin_of_a_map_is_rejected(tmp_path: Path) -> None:
     path = write_trinary(tmp_path / 'map', Grid(0.1, 0, 0, 3, 2), np.zeros((2, 3), np.int8))
     lines = [line for line in path.read_text().splitlines() if not line.startswith(('origin', '-', '  -'))]
     path.write_text('\n'.join([*lines, 'origin: !!python/tuple [0.0, 0.0, 0.0]']))
@@ -47,7 +47,7 @@ def test_no_tuple_passes_for_the_origin_of_a_map(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize('tag', TAGS)
-def test_parameters_are_read_by_a_safe_loader(tmp_path: Path, tag: str) -> None:
+def test_code_in_a_parameter_file_is_rejected(tmp_path: Path, tag: str) -> None:
     path, marker = tmp_path / 'p.yaml', tmp_path / 'marker'
     path.write_text(f'p_hit: {tag.format(marker=marker)}')
     with pytest.raises(ParameterError, match='not valid YAML'):
@@ -56,7 +56,7 @@ def test_parameters_are_read_by_a_safe_loader(tmp_path: Path, tag: str) -> None:
 
 
 class Trap:
-    """Makes a folder when it is unpickled."""
+    """Makes a folder when unpickled."""
 
     def __init__(self, marker: Path) -> None:
         self._marker = marker
@@ -69,7 +69,7 @@ class Trap:
     'name',
     ['live_map', 'ml_map', 'uncertainty_map', 'origin', 'resolution', 'log_likelihood', 'objective', 'parameters'],
 )
-def test_archives_are_read_without_pickles(tmp_path: Path, name: str) -> None:
+def test_pickle_in_an_archive_is_rejected(tmp_path: Path, name: str) -> None:
     path, marker = tmp_path / 'maps.npz', tmp_path / 'marker'
     write_npz(path, made_maps())
     with np.load(path, allow_pickle=False) as archive:
@@ -83,7 +83,7 @@ def test_archives_are_read_without_pickles(tmp_path: Path, name: str) -> None:
 
 
 @pytest.mark.parametrize('filling', ['\n', ' \n', '# x\n', '-\n', 'a: 1\n', '['])
-def test_very_long_files_are_refused_soon(tmp_path: Path, filling: str) -> None:
+def test_very_long_file_is_rejected(tmp_path: Path, filling: str) -> None:
     path = tmp_path / 'p.yaml'
     path.write_text(filling * (3_000_000 // len(filling)))
     with pytest.raises(ParameterError, match=r'p\.yaml.* more than 1,000,000 bytes'):
@@ -92,13 +92,13 @@ def test_very_long_files_are_refused_soon(tmp_path: Path, filling: str) -> None:
         read_map(path)
 
 
-def test_40_kb_of_blank_lines(tmp_path: Path) -> None:
+def test_file_with_80_kb_of_blank_lines_is_read(tmp_path: Path) -> None:
     path = tmp_path / 'p.yaml'
     path.write_text('\n' * 40_000 + 'p_hit: 0.6' + '\n' * 40_000)
     assert load_parameters(path).values == {'p_hit': 0.6}
 
 
-def test_a_device_without_end(tmp_path: Path) -> None:
+def test_endless_device_is_rejected(tmp_path: Path) -> None:
     if not Path('/dev/zero').exists():
         pytest.skip('there is no /dev/zero')
     (tmp_path / 'p.yaml').symlink_to('/dev/zero')

@@ -1,4 +1,4 @@
-"""The page of a run: its numbers are those of `explain`, a browser shows them, and nothing is taken as code."""
+"""The page of a run: its numbers are those of `explain`, it works in a browser, and no name is run as code."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ PATH = np.array([[0.0, 0.0], [1.0, 0.5]])
 
 @cache
 def drive() -> MapSet:
-    """The first 25 s of a drive along a corridor, with smooth walls and echoes that are lost."""
+    """The first 25 s of a drive along a corridor, with smooth walls and lost echoes."""
     readings = corridor_drive(0).readings
     first = np.argsort(readings.stamp, kind='stable')[:2400]
     return Mapper(Parameters.from_flat({})).run(readings.select(first))
@@ -56,7 +56,7 @@ def array(data: dict[str, Any], name: str) -> Any:
 
 
 def some_cells(maps: MapSet) -> list[tuple[int, int]]:
-    """Cells of every state, and those that most readings touch."""
+    """Cells of each state, and those with the most readings."""
     random, cells = np.random.default_rng(4), []
     for state, count in ((1, 25), (0, 15), (-1, 5)):
         rows, columns = np.nonzero(maps.ml == state)
@@ -65,7 +65,7 @@ def some_cells(maps: MapSet) -> list[tuple[int, int]]:
     return cells
 
 
-def test_cells_are_explained_as_by_explain(tmp_path: Path) -> None:
+def test_cells_are_explained_as_by_the_command_explain(tmp_path: Path) -> None:
     maps = drive()
     cells = some_cells(maps)
     script = """
@@ -76,10 +76,10 @@ def test_cells_are_explained_as_by_explain(tmp_path: Path) -> None:
             [r.t, r.nats, r.distance, r.kind])};
         });
     """.replace('CELLS', json.dumps(cells))
-    said = found_in(written(tmp_path, maps), tmp_path, script)
+    expected = found_in(written(tmp_path, maps), tmp_path, script)
     assert maps.normals.known.any(), 'the incidence angle must matter'
     x, y = maps.grid.centers()
-    for (row, column), cell in zip(cells, said, strict=True):
+    for (row, column), cell in zip(cells, expected, strict=True):
         place = float(x[column]), float(y[row])
         found = cell_evidence(maps.readings, maps.grid, maps.ml, maps.parameters, maps.normals, place)
         assert cell['data'] == pytest.approx(found.data, abs=1e-9)
@@ -93,7 +93,7 @@ def test_cells_are_explained_as_by_explain(tmp_path: Path) -> None:
             assert distance == pytest.approx(found.distance[k], abs=1e-9)
             assert (kind == 'end here') == found.ends_here[k]
             assert (kind == 'heard no echo') == found.silent[k]
-    kinds = [kind for cell in said for *_, kind in cell['readings']]
+    kinds = [kind for cell in expected for *_, kind in cell['readings']]
     assert len(kinds) > 200
     assert set(kinds) == {'end here', 'reach farther', 'heard no echo', 'end before it'}
 
@@ -157,7 +157,7 @@ USED = """
 
 
 @pytest.mark.parametrize(('width', 'height'), [(1280, 800), (390, 800)])
-def test_the_page_is_used(tmp_path: Path, width: int, height: int) -> None:
+def test_page_reacts_to_all_controls(tmp_path: Path, width: int, height: int) -> None:
     maps = drive()
     row, column = some_cells(maps)[0]
     x, y = maps.grid.centers()
@@ -185,7 +185,7 @@ def test_the_page_is_used(tmp_path: Path, width: int, height: int) -> None:
     assert min(out['canvas']) > 300
 
 
-def test_the_page_holds_the_maps(tmp_path: Path) -> None:
+def test_page_contains_the_maps(tmp_path: Path) -> None:
     maps = drive()
     data = numbers(written(tmp_path, maps))
     assert (array(data, 'ml_map').view(np.int8).reshape(maps.grid.shape) == maps.ml).all()
@@ -195,20 +195,20 @@ def test_the_page_holds_the_maps(tmp_path: Path) -> None:
         assert np.nanmax(np.abs(np.where(np.isnan(values), np.nan, steps / web_page.STEPS) - values)) < 1e-4
     causes = array(data, 'cause')
     assert np.count_nonzero(causes == RANDOM) == np.count_nonzero(maps.unexplained)
-    # p_lost is part of the model, so silence is one or the other
+    # p_lost is part of the model, so a reading without echo is one or the other
     silent = np.isin(causes, [CAUSES.index('lost'), CAUSES.index('no_echo')])
     assert not (silent & maps.readings.echo & (maps.readings.z < maps.readings.z_max - 1.0)).any()
     assert array(data, 'path').tolist() == PATH.ravel().tolist()
 
 
-def test_the_slider_has_the_standard_map_of_then(tmp_path: Path) -> None:
+def test_slider_shows_the_standard_map_at_each_moment(tmp_path: Path) -> None:
     maps = drive()
     page = written(tmp_path, maps)
     changes = array(numbers(page), 'moments').reshape(-1, *maps.grid.shape)
     then = list(moments(maps, web_page.MOMENTS))[:-1]
     assert len(changes) == len(then) == web_page.MOMENTS - 1
-    said = found_in(page, tmp_path, 'return report.moments.map(m => [m.until, [...m.values]])')
-    for (until, values), moment, steps in zip(said, then, changes.cumsum(axis=0, dtype=np.uint8), strict=True):
+    expected = found_in(page, tmp_path, 'return report.moments.map(m => [m.until, [...m.values]])')
+    for (until, values), moment, steps in zip(expected, then, changes.cumsum(axis=0, dtype=np.uint8), strict=True):
         assert until == moment.stamp / 1e9
         np.testing.assert_array_equal(np.array(values).reshape(maps.grid.shape), steps)
         np.testing.assert_array_equal(steps == web_page.UNKNOWN_THEN, np.isnan(moment.live))
@@ -256,20 +256,20 @@ def test_names_are_never_code(tmp_path: Path) -> None:
     assert numbers(pages[1])['sensors'][0]['name'] == evil
 
 
-def test_it_needs_no_network(tmp_path: Path) -> None:
+def test_page_needs_no_network(tmp_path: Path) -> None:
     text = written(tmp_path, made_maps()).read_text(encoding='utf-8')
     assert '://' not in text
     assert "default-src 'none'" in text
 
 
-def test_twelve_thousand_readings_are_below_five_megabytes(tmp_path: Path) -> None:
+def test_page_with_12000_readings_is_below_five_megabytes(tmp_path: Path) -> None:
     readings = corridor_drive(0).readings
     assert len(readings) == 12_000
     maps = Mapper(Parameters.from_flat({})).run(readings)
     assert written(tmp_path, maps).stat().st_size < 5_000_000
 
 
-def test_what_is_too_large_is_left_out(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_too_many_readings_or_cells_are_left_out(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     maps = made_maps()
     monkeypatch.setattr(web_page, 'MOST_READINGS', 10)
     page = written(tmp_path, maps)
@@ -282,7 +282,7 @@ def test_what_is_too_large_is_left_out(tmp_path: Path, monkeypatch: pytest.Monke
 
 
 @pytest.mark.parametrize('readings', [0, 10])
-def test_a_page_with_few_readings_opens(tmp_path: Path, readings: int) -> None:
+def test_page_with_few_readings_opens(tmp_path: Path, readings: int) -> None:
     page = written(tmp_path, made_maps(readings=readings))
     assert found_in(page, tmp_path, 'return [report.evidence.count, document.querySelectorAll("#cell p").length]') == [
         readings,
@@ -290,8 +290,8 @@ def test_a_page_with_few_readings_opens(tmp_path: Path, readings: int) -> None:
     ]
 
 
-@pytest.mark.parametrize(('count', 'said'), [(1, '1 reading ends here'), (2, '2 readings end here')])
-def test_readings_are_counted_in_words(tmp_path: Path, count: int, said: str) -> None:
+@pytest.mark.parametrize(('count', 'expected'), [(1, '1 reading ends here'), (2, '2 readings end here')])
+def test_number_of_readings_by_sensor_is_shown(tmp_path: Path, count: int, expected: str) -> None:
     script = """
         const found = report.evidence.cell(0, 0, true);
         const one = {t: 0, nats: 1, distance: 1, range: 1, silent: false, kind: 'end here'};
@@ -300,11 +300,11 @@ def test_readings_are_counted_in_words(tmp_path: Path, count: int, said: str) ->
         return $('cell').innerText;
     """
     text = found_in(written(tmp_path, made_maps(readings=10)), tmp_path, script.replace('COUNT', str(count)))
-    assert f'nats: {said}' in text
+    assert f'nats: {expected}' in text
     assert f'nats from {count} {"reading" if count == 1 else "readings"}, ' in text
 
 
-def test_several_drives_stay_apart(tmp_path: Path) -> None:
+def test_paths_of_several_drives_are_separate(tmp_path: Path) -> None:
     xy = np.full((30_001, 2), 0.5)
     xy[10_001] = np.nan
     xy[:10_001] = -0.5
@@ -325,7 +325,7 @@ def test_several_drives_stay_apart(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize('count', [2, 30])
-def test_each_drive_has_a_colour_and_the_first_ones_a_name(tmp_path: Path, count: int) -> None:
+def test_each_drive_has_a_colour_and_the_first_have_a_name(tmp_path: Path, count: int) -> None:
     paths = np.concatenate([[[k, 0.0], [k, 1.0], [np.nan, np.nan]] for k in range(count)])[:-1]
     maps, names = made_maps(), [f'day_{k}' for k in range(count)]
     write_page(
@@ -343,14 +343,14 @@ def test_each_drive_has_a_colour_and_the_first_ones_a_name(tmp_path: Path, count
     assert legend == shown + ([f'and {count - len(shown)} more'] if count > len(shown) else [])
 
 
-def test_a_path_far_from_the_origin_is_as_exact(tmp_path: Path) -> None:
+def test_path_far_from_the_origin_is_exact(tmp_path: Path) -> None:
     xy = np.linspace([500_000.0, 5_200_000.0], [500_009.0, 5_200_003.0], 100)
     maps = made_maps()
     write_page(tmp_path / 'report.html', maps, report_data(maps, {}), 'far', xy)
     assert np.array_equal(array(numbers(tmp_path / 'report.html'), 'path').reshape(-1, 2), xy)
 
 
-def test_a_long_path_is_thinned(tmp_path: Path) -> None:
+def test_long_path_is_thinned(tmp_path: Path) -> None:
     xy = np.stack([np.linspace(0, 9, 50_000), np.zeros(50_000)], 1)
     maps = made_maps()
     write_page(tmp_path / 'report.html', maps, report_data(maps, {}), 'long', xy, xy + 1, (maps.grid, maps.ml))

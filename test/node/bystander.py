@@ -1,4 +1,4 @@
-"""A process that the tests of faults kill or stop: it calls a service, listens to a map, or publishes a drive."""
+"""A process that the tests of faults kill or stop: it calls a service, subscribes to a map, or publishes a drive."""
 
 from __future__ import annotations
 

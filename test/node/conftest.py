@@ -16,7 +16,7 @@ sys.path.insert(0, str(Path(__file__).parent))
 
 @pytest.fixture
 def clock(monkeypatch: pytest.MonkeyPatch) -> Any:
-    """A monotonic clock that stands at `now`, seconds."""
+    """A monotonic clock that stays at `now`, seconds."""
     made = SimpleNamespace(now=50.0)
     monkeypatch.setattr(time, 'monotonic', lambda: made.now)
     return made
@@ -24,7 +24,7 @@ def clock(monkeypatch: pytest.MonkeyPatch) -> Any:
 
 @pytest.fixture
 def start(domain: int, tmp_path: Path) -> Iterator[Callable[..., Any]]:
-    """Start nodes, which are ended after the test; `ready` waits until they listen."""
+    """Start nodes in other processes, and end them after the test; `ready` waits until they subscribe."""
     from robot import NodeProcess
 
     nodes = []
@@ -53,7 +53,7 @@ def robot(domain: int) -> Iterator[Any]:
 
 @pytest.fixture
 def inside(domain: int, tmp_path: Path) -> Iterator[Callable[..., Any]]:
-    """Make nodes in this process, which are ended after the test."""
+    """Make nodes in this process, and end them after the test."""
     from inside import Inside
 
     nodes = []
@@ -70,7 +70,7 @@ def inside(domain: int, tmp_path: Path) -> Iterator[Callable[..., Any]]:
 
 @pytest.fixture
 def quick(monkeypatch: pytest.MonkeyPatch) -> type[Any]:
-    """A refiner that is done at once; `quick.accepts = False` makes it refuse."""
+    """A refiner that finds a trajectory at once; with `quick.accepts = False` it rejects it."""
     from drift_samples import QuickRefiner
 
     from forward_grid_mapper.node import refining

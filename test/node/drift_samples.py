@@ -1,4 +1,4 @@
-"""A drive whose odometry drifts, as messages, as a bag, and as the parameters that tell where its sensors sit."""
+"""A drive with odometry that drifts, as messages, and parameters with the poses of its sensors."""
 
 from __future__ import annotations
 
@@ -23,17 +23,17 @@ Message = RangeMessage | OdometryMessage
 
 
 def exact_drive() -> Recording:
-    """25 m through a building."""
+    """A drive of 25 m through a building."""
     return drive(building_world(), building_tour()[:10], 0.15, sonar_ring(16), NOISY, seed=3)
 
 
 def bent_drive() -> Recording:
-    """The same, 0.8 m off in the root mean square."""
+    """The drive with odometry that drifts, 0.8 m off in the root mean square."""
     return with_drift(exact_drive(), LEVELS['high'], 6)
 
 
 def in_turn(recording: Recording) -> list[Message]:
-    """The messages by stamp, odometry before the ranges of its stamp."""
+    """The messages by stamp, odometry before the ranges with the same stamp."""
     messages: list[Message] = [*recording.odometry, *recording.ranges]
     return sorted(messages, key=lambda message: message.stamp)
 
@@ -48,7 +48,7 @@ def write_parameters(path: Path, recording: Recording, **values: Any) -> Path:
 
 
 def bend(odometry: Odometry) -> Odometry:
-    """Return a trajectory that differs from odometry by a curve, and by one metre at its end at least."""
+    """Return a trajectory that differs from odometry by a curve, and by at least one metre at its end."""
     count = len(odometry.stamp)
     turned = compose(odometry.pose[0], np.array([0.0, 0.0, 0.5]))
     ahead = compose(turned, np.stack([np.linspace(0.0, 1.0, count), np.zeros(count), np.zeros(count)], 1))
@@ -57,7 +57,7 @@ def bend(odometry: Odometry) -> Odometry:
 
 
 class QuickRefiner:
-    """Stands in for `Refiner`: finds the trajectory of `bend` at once, or what the test says."""
+    """Stand-in for `Refiner`: returns the trajectory of `bend` at once, or rejects it."""
 
     accepts = True
 

@@ -1,4 +1,4 @@
-"""EM as the node's callers see it, without a middleware and with a search that the test holds up and lets go on."""
+"""EM with its services, without a middleware; the test controls how long each search takes."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ def some_readings(count: int, first: int = 0) -> Readings:
 
 
 class Answer:
-    """What a caller was told."""
+    """The responses to a caller."""
 
     def __init__(self) -> None:
         self.sent: list[tuple[bool, str]] = []
@@ -49,7 +49,7 @@ class Answer:
 
 
 class Search:
-    """Stands in for a mapper: begins, waits for the test, and finds maps of its readings."""
+    """Stand-in for a mapper: a search that waits for the test, and then returns maps of its readings."""
 
     def __init__(self, robot: EmRobot) -> None:
         self.begun, self.go_on, self.cancelled = threading.Event(), threading.Event(), False
@@ -85,7 +85,7 @@ class Search:
 
 
 class PlainTrajectory:
-    """As much of a trajectory as EM asks for."""
+    """Stand-in for a trajectory, with what EM needs of it."""
 
     def __init__(self, robot: EmRobot) -> None:
         self.robot, self.on, self.correction, self.found, self.words = robot, False, None, None, ''
@@ -104,12 +104,12 @@ class PlainTrajectory:
 
 
 class EmRobot:
-    """The executor, the parts that EM works with, and what these were given.
+    """The executor, the parts that EM uses, and their inputs.
 
     Attributes
     ----------
     searches : list of Search
-        Those that began, in order; each waits for the test while `held`.
+    All searches in order; each waits for the test while `held`.
     published : list of (name, generation, grid, values)
     """
 
@@ -164,7 +164,7 @@ class EmRobot:
         self.associator.restore(some_readings(count, len(self.associator.buffer)))
 
     def until(self, condition: Callable[[], Any]) -> None:
-        """Turn the executor until something is so."""
+        """Turn the executor until the condition holds."""
         end = time.monotonic() + 60.0
         while not condition():
             assert time.monotonic() < end
@@ -172,7 +172,7 @@ class EmRobot:
             time.sleep(0.001)
 
     def settle(self) -> None:
-        """Turn it until nothing goes on."""
+        """Turn the executor until EM and its worker are idle."""
         self.until(lambda: self.em.current is None and not self.em.worker.worker.waiting)
         self.node.turn()
 
@@ -187,9 +187,9 @@ class EmRobot:
         return answer
 
     def wait_for_maps(self) -> list[Outcome]:
-        told: list[Outcome] = []
-        self.em.when_there_are_maps(told.append)
-        return told
+        outcomes: list[Outcome] = []
+        self.em.when_there_are_maps(outcomes.append)
+        return outcomes
 
     def begun(self) -> Search:
         """Wait until the newest search has begun."""

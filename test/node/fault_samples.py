@@ -1,4 +1,4 @@
-"""What all tests of faults need: drives, and a journal that gives a node many readings at once."""
+"""Helpers of the tests of faults: drives, and a journal that gives a node many readings at once."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ OPTIONS = (
 
 
 def circle(first: int, count: int) -> list[Any]:
-    """Readings of a robot that turns, an odometry message with each; twenty a second."""
+    """Readings of a turning robot with odometry messages, twenty a second."""
     out: list[Any] = []
     for k in range(first, first + count):
         stamp = 2_000_000_000 * NANOSECONDS + k * NANOSECONDS // 20
@@ -26,7 +26,7 @@ def circle(first: int, count: int) -> list[Any]:
 
 
 def journal_of(folder: Path, readings: Readings) -> Path:
-    """Write a journal as if a node had been killed after these readings."""
+    """Write a journal as of a node that was killed after these readings."""
     journal = Journal(folder, print)
     assert not list(journal.restore())
     journal.put(readings, ('odom', 'base_link'))

@@ -1,4 +1,4 @@
-"""The node in the process of the test, which turns its executor and looks into its parts."""
+"""The node in the process of the test, which turns the executor and has access to all parts."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from forward_grid_mapper.node.mapper_node import MapperNode
 
 
 class Answer:
-    """What a handler of a service answers with."""
+    """The responses of a service."""
 
     def __init__(self, request: Any = None) -> None:
         self.request = request
@@ -36,7 +36,7 @@ class Answer:
 
 
 class Inside:
-    """A node whose callbacks the test calls, and whose executor it turns."""
+    """A node in this process; the test calls its callbacks and turns its executor."""
 
     def __init__(self, domain: int, folder: Path, **parameters: Any) -> None:
         os.environ['ROS_AUTOMATIC_DISCOVERY_RANGE'] = 'LOCALHOST'
@@ -59,7 +59,7 @@ class Inside:
         return self
 
     def until(self, condition: Callable[[], Any], seconds: float = 200.0) -> Any:
-        """Turn the executor until something is so."""
+        """Turn the executor until the condition holds."""
         end = time.monotonic() + seconds
         while not (value := condition()):
             assert time.monotonic() < end, f'it did not happen: {condition}'
@@ -67,13 +67,13 @@ class Inside:
         return value
 
     def spin(self, seconds: float) -> None:
-        """Turn the executor for a while."""
+        """Turn the executor for some seconds."""
         end = time.monotonic() + seconds
         while time.monotonic() < end:
             self.executor.spin_once(timeout_sec=0.01)
 
     def odometry(self, seconds: float, x: float = 0.0) -> None:
-        """Hand the node an odometry message."""
+        """Give the node an odometry message."""
         made = Odometry(child_frame_id='base_link')
         made.header.frame_id = 'odom'
         made.pose.pose.position.x, made.pose.pose.orientation.w = x, 1.0
@@ -81,7 +81,7 @@ class Inside:
         self.node.intake.on_odometry(made, {'source_timestamp': time.time_ns()})
 
     def range(self, seconds: float, value: float = 2.0, number: int | None = None, frame: str = 'sonar') -> None:
-        """Hand the node a Range."""
+        """Give the node a Range message."""
         made = Range(min_range=0.1, max_range=5.0, field_of_view=0.3, range=value)
         made.header.frame_id = frame
         self._stamp(made.header, seconds)
@@ -91,7 +91,7 @@ class Inside:
         intake.on_range(intake.range_losses[0], made, info)
 
     def hand(self, messages: Sequence[RangeMessage | OdometryMessage]) -> None:
-        """Hand the node messages of a drive, and turn the executor until it has taken them."""
+        """Give the node messages of a drive, and turn the executor until they are processed."""
         for k, message in enumerate(messages):
             made = ros_message(message)
             if isinstance(message, RangeMessage):
@@ -110,7 +110,7 @@ class Inside:
         header.stamp.sec, header.stamp.nanosec = divmod(round(seconds * NANOSECONDS), NANOSECONDS)
 
     def drive(self, first: int, count: int) -> None:
-        """Hand the node so many readings of a robot that drives slowly, an odometry message with each."""
+        """Give the node readings of a robot that drives slowly, each with an odometry message."""
         for k in range(first, first + count):
             self.odometry(100.0 + 0.05 * k, 0.001 * k)
             self.range(100.0 + 0.05 * k)
@@ -122,7 +122,7 @@ class Inside:
         assert all(result.successful for result in results), results
 
     def status(self, part: str) -> dict[str, Any]:
-        """Have the node report, and return what it says of a part."""
+        """Let the node publish diagnostics, and return those of a part."""
         found: dict[str, Any] = {}
         reporter: Any = self.node.reporter
         publish, reporter._out.publish = (
@@ -145,20 +145,20 @@ class Inside:
         return dict(found[part])
 
     def begin(self, handler: Callable[[Any], None], request: Any = None) -> Answer:
-        """Call a service, and return what it will answer with."""
+        """Call a service, and return the object that receives the response."""
         answer = Answer(request)
         handler(answer)
         return answer
 
     def call(self, handler: Callable[[Any], None], request: Any = None) -> tuple[Any, ...]:
-        """Call a service, and turn the executor until it answers."""
+        """Call a service, and turn the executor until it responds."""
         answer = self.begin(handler, request)
         self.until(lambda: answer.sent)
         assert len(answer.sent) == 1
         return answer.sent[0]
 
     def close(self) -> None:
-        """End the node; no more than once."""
+        """Close the node, if it is not closed yet."""
         if self._closed:
             return
         self._closed = True

@@ -1,4 +1,4 @@
-"""A node inside the process of the test, whose trajectory a quick refiner finds, and what its live map has to be."""
+"""A node in the process of the test with a quick refiner, and its expected live map."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from forward_grid_mapper.core.trajectory.windows import Odometry
 
 
 class HeldRun:
-    """EM that has begun, and waits until it may go on."""
+    """A run of EM that waits until the test lets it continue."""
 
     def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
         self.begun, self.go_on = threading.Event(), threading.Event()
@@ -43,14 +43,14 @@ def refined(robot: Inside, *, count: int = 200) -> tuple[Inside, Odometry]:
 
 
 def live_of(robot: Inside) -> tuple[Any, np.ndarray]:
-    """The live map of all readings that the node has taken."""
+    """The live map of all readings received by the node."""
     robot.node.feed.feed()
     snapshot = robot.node.live.snapshot()
     return snapshot.grid, snapshot.probability
 
 
 def expected_live(robot: Inside, bent: Odometry | None) -> tuple[Any, np.ndarray]:
-    """The live map of all readings, each where it was before `bent`, or as odometry has it."""
+    """The expected live map of all readings: along the refined trajectory for odometry until `bent`, or of odometry."""
     readings = robot.node.associator.readings
     if bent is not None:
         then = bend(bent)
@@ -71,6 +71,6 @@ def assert_live(robot: Inside, bent: Odometry | None) -> None:
 
 
 def begin(robot: Inside) -> None:
-    """Have the node see where the robot begins to drive."""
+    """Let the node receive the first messages of the drive."""
     robot.drive(0, 1)
     robot.until(lambda: robot.node.trajectory._at is not None)

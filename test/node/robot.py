@@ -1,4 +1,4 @@
-"""A robot for the tests of the node: starts the node in a second process, talks to it over DDS, and listens."""
+"""A robot for the tests of the node: it starts the node in a second process and communicates with it over DDS."""
 
 from __future__ import annotations
 
@@ -34,10 +34,10 @@ LATCHED = QoSProfile(depth=1, reliability=ReliabilityPolicy.RELIABLE, durability
 RELIABLE = QoSProfile(depth=100_000, reliability=ReliabilityPolicy.RELIABLE)
 MAPS = ('live_map', 'ml_map', 'uncertainty_map')
 KEPT = 1500
-"""Readings that may be on their way; of more than 2000 messages of a topic, the middleware drops some."""
+"""Most readings in transit; the middleware keeps only 2000 messages of a topic."""
 
 START_TIME = 240.0
-"""Seconds; a first start compiles every kernel, on a machine that may have other work."""
+"""Seconds; the first start compiles all kernels, on a machine that may be busy."""
 
 
 def environment(domain: int, **changes: str) -> dict[str, str]:
@@ -51,7 +51,7 @@ def environment(domain: int, **changes: str) -> dict[str, str]:
 
 
 class NodeProcess:
-    """The node in a process of its own; its output is kept in a file."""
+    """The node in a separate process, with its output in a file."""
 
     def __init__(self, domain: int, log: Path, arguments: Sequence[str] = (), **changes: str) -> None:
         self.log = log
@@ -85,7 +85,7 @@ class NodeProcess:
 
 
 def ros_message(message: RangeMessage | OdometryMessage) -> Any:
-    """Return the message as ROS has it."""
+    """Return the message as a ROS message."""
     out: Any
     if isinstance(message, RangeMessage):
         out = Range(
@@ -107,7 +107,7 @@ def ros_message(message: RangeMessage | OdometryMessage) -> Any:
 
 
 class Robot:
-    """Publishes ranges and odometry, calls services, and keeps what the node publishes."""
+    """Publishes ranges and odometry, calls services, and keeps the messages of the node."""
 
     def __init__(self, domain: int, node: str = '/forward_grid_mapper', prefix: str = '/') -> None:
         os.environ['ROS_AUTOMATIC_DISCOVERY_RANGE'] = 'LOCALHOST'
@@ -121,7 +121,7 @@ class Robot:
         self.odom_out = self.node.create_publisher(Odometry, f'{prefix}odom', RELIABLE)
         self.maps: dict[str, list[OccupancyGrid]] = {name: [] for name in MAPS}
         self.diagnostics: dict[str, Any] = {}
-        # seconds of the node's clock, as it reports
+        # seconds of the clock of the node, as in its diagnostics
         self.time = -1
         self.node.create_subscription(DiagnosticArray, '/diagnostics', self._on_diagnostics, 10)
 
@@ -151,7 +151,7 @@ class Robot:
         return value
 
     def meet(self) -> None:
-        """Wait until the node receives from the robot."""
+        """Wait until the node has subscribed to the topics of the robot."""
         both = (self.range_out, self.odom_out)
         self.until(lambda: all(p.get_subscription_count() for p in both), 20.0, 'the node subscribes')
 
@@ -161,11 +161,11 @@ class Robot:
 
     @property
     def received(self) -> int:
-        """Readings that the node says it has received, -1 before it says anything."""
+        """Number of received readings in the diagnostics, -1 before the first diagnostics."""
         return int(self.diagnostics.get('readings', {}).get('readings received', -1))
 
     def play(self, messages: Sequence[RangeMessage | OdometryMessage], rate: float = 1500.0) -> None:
-        """Send messages at a steady rate, no more than the middleware keeps, and wait until the node has taken all."""
+        """Send messages at a steady rate, at most as many as the middleware keeps, until the node has received all."""
         self.sent = getattr(self, 'sent', 0)
         begin = time.monotonic()
         for k, message in enumerate(messages):
@@ -182,7 +182,7 @@ class Robot:
         return self.until(self.ask(service, kind, **fields).result, seconds, f'{service} answers')
 
     def ask(self, service: str, kind: Any = Trigger, **fields: Any) -> Any:
-        # every client receives the answers to all of them, and keeps the last 10 unless asked otherwise
+        # each client receives the responses to all clients, and keeps the last 10 by default
         client = self.node.create_client(kind, f'{self.name}/{service}', qos_profile=QoSProfile(depth=100))
         self.until(client.service_is_ready, 20.0, f'{service} is there')
         return client.call_async(kind.Request(**fields))

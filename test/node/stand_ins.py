@@ -1,4 +1,4 @@
-"""What parts of the node need of rclpy, without a middleware: the test says when what is called."""
+"""Stand-ins for the parts of rclpy that the node uses: the test decides what is called when."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from forward_grid_mapper.node.intake import AT_ONCE, Intake
 
 
 class Guard:
-    """A guard condition: `turn` of the node calls what it guards."""
+    """A guard condition; `turn` of the node calls its callback."""
 
     def __init__(self, callback: Callable[[], None]) -> None:
         self.callback, self.triggered = callback, False
@@ -26,14 +26,14 @@ class Guard:
 
 
 class PlainNode:
-    """As much of a node as a part of ours asks for.
+    """Stand-in for a node, with what its parts need.
 
     Attributes
     ----------
     warned : list of str
-        What the log was told.
+    The lines of the log.
     publishers : int
-        How many publish any topic.
+    The number of publishers of any topic.
     subscribed : dict of topic → (callback, QoSProfile)
     """
 
@@ -57,7 +57,7 @@ class PlainNode:
         return made
 
     def turn(self) -> int:
-        """Call what was triggered, again and again; return how often."""
+        """Call triggered callbacks until none is left; return how many were called."""
         turns = 0
         while triggered := [guard for guard in self._guards if guard.triggered]:
             for guard in triggered:
@@ -114,7 +114,7 @@ class Taking:
         self.intake.on_range(self.intake.range_losses[topic], made, info)
 
     def account(self) -> tuple[int, int, int, int]:
-        """Received, accepted, waiting and rejected readings; the first is the sum of the others."""
+        """Numbers of received, accepted, waiting and rejected readings; the first is the sum of the others."""
         rejected = sum(self.associator.rejected.values())
         found = self.intake.received, len(self.associator.buffer), self.intake.waiting, rejected
         assert found[0] == found[1] + found[2] + found[3]

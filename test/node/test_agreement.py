@@ -1,4 +1,4 @@
-"""Node and offline tool map from the same readings, and to the same live map, whatever comes together."""
+"""Node and offline tool use the same readings and make the same live map, for any order of messages."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ EXTRINSICS = {'left': Pose2(0.1, 0.1, 1.5), 'right': Pose2(0.1, -0.1, -1.5)}
 
 
 def drive(rng: random.Random) -> list[Any]:
-    """Messages by stamp: a robot that wanders, now and then far or with a gap in its odometry."""
+    """Messages by stamp of a robot on a random path, sometimes far away or with a gap in odometry."""
     messages: list[Any] = []
     x = y = yaw = 0.0
     gap = rng.uniform(1.0, 4.0)
@@ -35,7 +35,7 @@ def drive(rng: random.Random) -> list[Any]:
         for frame in EXTRINSICS:
             z = rng.choice((rng.uniform(0.05, 4.5), 4.0, 0.6, float('inf')))
             messages.append(RangeMessage(stamp + rng.randrange(40_000_000), frame, z, 0.1, 4.0, 0.3))
-    # so that odometry reaches every range, as the offline tool has it to the end
+    # so that odometry covers all ranges, as at the end of the offline tool
     messages.append(OdometryMessage(messages[-1].stamp + NANOSECONDS // 10, 'odom', 'base', Pose2(x, y, yaw)))
     return sorted(messages, key=lambda message: message.stamp)
 
@@ -45,7 +45,7 @@ def lookup(base: str, frame: str, stamp: int) -> Pose2:
 
 
 def late(messages: list[Any], rng: random.Random) -> list[Any]:
-    """The messages as they may arrive: each stream in its order, ranges up to a second early or late."""
+    """The messages in order of arrival: each topic in order, ranges up to a second early or late."""
     lag = rng.uniform(-1.0, 1.0) * NANOSECONDS
     return sorted(messages, key=lambda message: message.stamp + (lag if isinstance(message, RangeMessage) else 0))
 
@@ -83,7 +83,7 @@ def of_the_node(messages: list[Any], parameters: Parameters, rng: random.Random)
 
 
 @pytest.mark.parametrize('max_readings', [0, 60])
-def test_any_order_and_any_batches_give_the_same(max_readings: int) -> None:
+def test_node_and_offline_use_the_same_readings_in_any_order(max_readings: int) -> None:
     parameters = Parameters.from_flat({'max_readings': max_readings})
     for seed in range(DRIVES):
         rng = random.Random(seed)

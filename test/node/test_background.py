@@ -1,4 +1,4 @@
-"""Workers: whatever their work raises, whoever waits is told, and the next piece is done."""
+"""Workers: any error is reported to all callers, and the next work is done."""
 
 from __future__ import annotations
 
@@ -55,19 +55,19 @@ def test_work_is_done_in_order_by_one_thread(worker: Worker) -> None:
         (KeyboardInterrupt(), 'KeyboardInterrupt()'),
     ],
 )
-def test_whatever_is_raised_is_told_logged_and_shown(worker: Worker, error: BaseException, why: str) -> None:
-    told: list[str] = []
-    worker.put(raising(error), told.append)
+def test_error_is_reported_logged_and_shown(worker: Worker, error: BaseException, why: str) -> None:
+    failures: list[str] = []
+    worker.put(raising(error), failures.append)
     with pytest.raises(MapperError, match='no second try'):
         worker.ask(raising(InputError('no second try')))
-    assert told == [why]
+    assert failures == [why]
     assert logged == [f'digger: {why}', 'digger: no second try']
     assert worker.trouble == 'no second try'
     assert worker.ask(lambda: 7) == 7
     assert worker.ask(lambda: worker.trouble) == ''
 
 
-def test_trouble_that_lasts_does_so_until_it_is_forgiven() -> None:
+def test_lasting_trouble_stays_until_it_is_cleared() -> None:
     worker = Worker('digger', logged.append, lasting=True)
     worker.put(raising(KeyError('odd')))
     assert worker.ask(lambda: 1) == 1
@@ -77,7 +77,7 @@ def test_trouble_that_lasts_does_so_until_it_is_forgiven() -> None:
     worker.close(10.0)
 
 
-def test_a_listener_and_a_log_that_fail_end_nothing() -> None:
+def test_worker_continues_after_errors_of_listener_and_log() -> None:
     worker = Worker('digger', raising_log)
     worker.put(raising(KeyError('odd')), lambda why: raising(ValueError('deaf'))())
     assert worker.ask(lambda: 3) == 3
@@ -88,23 +88,23 @@ def raising_log(text: str) -> None:
     raise MemoryError
 
 
-def test_a_thread_that_cannot_start_is_told_to_all_who_wait(worker: Worker, monkeypatch: pytest.MonkeyPatch) -> None:
-    told: list[str] = []
+def test_failed_start_of_the_thread_is_reported_to_all_callers(worker: Worker, monkeypatch: pytest.MonkeyPatch) -> None:
+    failures: list[str] = []
 
     def fail(self: threading.Thread) -> None:
         raise RuntimeError("can't start new thread")
 
     with monkeypatch.context() as patch:
         patch.setattr(threading.Thread, 'start', fail)
-        worker.put(lambda: None, told.append)
+        worker.put(lambda: None, failures.append)
         with pytest.raises(MapperError, match='new thread'):
             worker.ask(lambda: None)
-    assert len(told) == 1 and "can't start new thread" in told[0]
+    assert len(failures) == 1 and "can't start new thread" in failures[0]
     assert 'new thread' in worker.trouble
     assert worker.ask(lambda: 5) == 5
 
 
-def test_closing_waits_for_what_was_begun_and_leaves_the_rest(worker: Worker) -> None:
+def test_closing_waits_for_the_current_work_and_drops_the_rest(worker: Worker) -> None:
     begun, go_on, done = threading.Event(), threading.Event(), []
 
     def work() -> None:
@@ -126,19 +126,17 @@ def test_closing_waits_for_what_was_begun_and_leaves_the_rest(worker: Worker) ->
     assert done == ['first']
 
 
-def test_what_is_done_does_not_wait_any_more(worker: Worker) -> None:
+def test_finished_work_is_not_counted_as_waiting(worker: Worker) -> None:
     assert worker.waiting == 0
     worker.ask(lambda: None)
-    # the answer comes a moment before the thread looks for the next piece
+    # the result comes a moment before the thread takes the next work
     end = time.monotonic() + 60.0
     while worker.waiting:
         assert time.monotonic() < end
         time.sleep(0.001)
 
 
-def test_whoever_asks_is_answered_even_where_there_is_no_memory_for_the_reason(
-    worker: Worker, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_caller_gets_an_error_without_memory_for_the_reason(worker: Worker, monkeypatch: pytest.MonkeyPatch) -> None:
     class Full(list[str]):
         def append(self, text: str) -> None:
             raise MemoryError
@@ -150,7 +148,7 @@ def test_whoever_asks_is_answered_even_where_there_is_no_memory_for_the_reason(
     assert worker.ask(lambda: 5) == 5
 
 
-def test_a_piece_that_is_taken_up_counts_at_every_moment() -> None:
+def test_work_counts_as_waiting_while_it_is_taken() -> None:
     worker, counted = Worker('digger', logged.append), list[int]()
 
     class Counting(deque[Any]):
@@ -165,7 +163,7 @@ def test_a_piece_that_is_taken_up_counts_at_every_moment() -> None:
     assert counted == [1]
 
 
-def test_whoever_asks_a_worker_that_has_ended_is_told(worker: Worker) -> None:
+def test_call_of_a_closed_worker_raises(worker: Worker) -> None:
     worker.close(10.0)
     with pytest.raises(MapperError, match='digger has ended'):
         worker.ask(lambda: None)
@@ -173,7 +171,7 @@ def test_whoever_asks_a_worker_that_has_ended_is_told(worker: Worker) -> None:
 
 @pytest.mark.skipif(sys.platform != 'linux', reason='elsewhere a thread has no priority of its own')
 @pytest.mark.parametrize('nice', [NICE, 0])
-def test_a_worker_gives_way_unless_it_is_told_not_to(nice: int) -> None:
+def test_worker_has_the_given_priority(nice: int) -> None:
     worker = Worker('digger', logged.append, nice=nice)
     own = os.getpriority(os.PRIO_PROCESS, 0)
     found = worker.ask(lambda: os.getpriority(os.PRIO_PROCESS, threading.get_native_id()))
@@ -191,14 +189,14 @@ class Guard:
 
 
 class Executor:
-    """As much of a node as an inbox needs."""
+    """Stand-in for a node, with what an inbox needs."""
 
     def create_guard_condition(self, callback: Callable[[], None]) -> Guard:
         self.guard = Guard(callback)
         return self.guard
 
     def run(self) -> int:
-        """Do what was asked for; return in how many turns."""
+        """Run the callback until it is not triggered again; return the number of turns."""
         turns = 0
         while self.guard.triggered:
             self.guard.triggered = 0
@@ -207,7 +205,7 @@ class Executor:
         return turns
 
 
-def test_results_come_back_in_order_and_a_few_at_a_time() -> None:
+def test_results_are_delivered_in_order_and_in_portions() -> None:
     executor = Executor()
     inbox, done = Inbox(executor), queue.Queue[Any]()
     threads = [
@@ -224,7 +222,7 @@ def test_results_come_back_in_order_and_a_few_at_a_time() -> None:
         assert [k for m, k in found if m == n] == list(range(100))
 
 
-def test_a_result_that_fails_does_not_hold_up_the_others() -> None:
+def test_failing_result_does_not_block_the_others() -> None:
     executor = Executor()
     inbox, done = Inbox(executor), []
     inbox.put(raising(KeyError('odd')))
@@ -235,7 +233,7 @@ def test_a_result_that_fails_does_not_hold_up_the_others() -> None:
     assert done == [1]
 
 
-def test_what_is_left_for_a_node_that_was_destroyed_is_dropped() -> None:
+def test_results_for_a_destroyed_node_are_dropped() -> None:
     executor = Executor()
     inbox = Inbox(executor)
 

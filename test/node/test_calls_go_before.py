@@ -1,4 +1,4 @@
-"""A call of run_em while the node runs EM by itself goes before, and is answered with what is as new as the call."""
+"""A call of run_em replaces a run that the node began by itself, unless that run has all readings and parameters."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from forward_grid_mapper.core.mapping import Mapper
 
 
 class Begun:
-    """A node that runs EM by itself on so many readings, and counts the readings of each run."""
+    """A node that has begun EM by itself with `count` readings; `runs` has the number of readings of each run."""
 
     def __init__(self, inside: Callable[..., Inside], monkeypatch: pytest.MonkeyPatch, count: int = 100) -> None:
         self.runs: list[int] = []
@@ -39,7 +39,7 @@ class Begun:
         return self.robot.node.em
 
     def end(self, *answers: Answer) -> None:
-        """Let runs go on, and turn the executor until all is answered."""
+        """Let runs continue, and turn the executor until all calls have responses."""
         self.held.go_on.set()
         self.robot.until(lambda: all(answer.sent for answer in answers) and self.em.current is None)
         assert all(len(answer.sent) == 1 for answer in answers)
@@ -50,7 +50,7 @@ def begun(inside: Callable[..., Inside], quick: Any, monkeypatch: pytest.MonkeyP
     return Begun(inside, monkeypatch)
 
 
-def test_it_is_joined_where_nothing_came_since(begun: Begun) -> None:
+def test_call_joins_a_run_without_newer_readings(begun: Begun) -> None:
     answer = begun.robot.begin(begun.em.run_em)
     refused = begun.robot.begin(begun.em.run_em)
     assert 'EM is already running' in refused.sent[0][1], 'the one who called has asked for this run'
@@ -60,7 +60,7 @@ def test_it_is_joined_where_nothing_came_since(begun: Begun) -> None:
     assert begun.runs == [100]
 
 
-def test_it_ends_a_run_that_lacks_readings_and_begins_anew(begun: Begun) -> None:
+def test_call_replaces_a_run_without_the_newest_readings(begun: Begun) -> None:
     begun.robot.drive(100, 50)
     answer = begun.robot.begin(begun.em.run_em)
     assert not answer.sent
@@ -73,7 +73,7 @@ def test_it_ends_a_run_that_lacks_readings_and_begins_anew(begun: Begun) -> None
     assert 'trajectory refined' in begun.em.last_run
 
 
-def test_other_parameters_make_it_old(begun: Begun) -> None:
+def test_call_replaces_a_run_with_old_parameters(begun: Begun) -> None:
     begun.robot.set(p_hit=0.6)
     answer = begun.robot.begin(begun.em.run_em)
     begun.end(answer)
@@ -81,19 +81,19 @@ def test_other_parameters_make_it_old(begun: Begun) -> None:
     assert begun.em.maps.parameters.model.p_hit == 0.6
 
 
-def test_who_waits_for_maps_waits_for_the_new_ones(begun: Begun) -> None:
-    told: list[Any] = []
-    begun.em.when_there_are_maps(told.append)
+def test_save_maps_waits_for_the_maps_of_the_new_run(begun: Begun) -> None:
+    outcomes: list[Any] = []
+    begun.em.when_there_are_maps(outcomes.append)
     begun.robot.drive(100, 50)
     answer = begun.robot.begin(begun.em.run_em)
-    begun.em.when_there_are_maps(told.append)
+    begun.em.when_there_are_maps(outcomes.append)
     begun.end(answer)
     assert answer.sent[0][0]
-    assert [len(outcome.maps.readings) for outcome in told] == [150, 150]
+    assert [len(outcome.maps.readings) for outcome in outcomes] == [150, 150]
 
 
 @pytest.mark.parametrize('ends', ['cancel_em', 'reset'])
-def test_who_goes_before_is_told_of_the_end(begun: Begun, ends: str) -> None:
+def test_call_that_replaces_a_run_fails_if_it_is_cancelled(begun: Begun, ends: str) -> None:
     begun.robot.drive(100, 50)
     answer = begun.robot.begin(begun.em.run_em)
     end = begun.robot.begin(begun.em.cancel if ends == 'cancel_em' else begun.robot.node.reset)
@@ -105,7 +105,7 @@ def test_who_goes_before_is_told_of_the_end(begun: Begun, ends: str) -> None:
     assert begun.em.maps is None
 
 
-def test_a_call_after_cancelling_waits_for_the_end_and_runs(begun: Begun) -> None:
+def test_call_after_cancelling_waits_and_runs(begun: Begun) -> None:
     cancelled = begun.robot.begin(begun.em.cancel)
     answer = begun.robot.begin(begun.em.run_em)
     begun.end(answer, cancelled)
@@ -113,7 +113,7 @@ def test_a_call_after_cancelling_waits_for_the_end_and_runs(begun: Begun) -> Non
     assert answer.sent[0][0] and begun.runs == [100, 100]
 
 
-def test_a_run_that_was_asked_for_is_not_ended(
+def test_requested_run_is_not_replaced(
     inside: Callable[..., Inside], quick: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     robot = inside(refine_poses=True).start()

@@ -1,4 +1,4 @@
-"""The service cancel_em: ends EM, answers everybody in words, and forgets nothing."""
+"""The service cancel_em ends EM, responds to all callers, and keeps readings and earlier maps."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ SO_FAR = Grid(0.1, 0, 0, 3, 3)
 
 
 class Endless:
-    """Has EM go on until it is cancelled, and show a map of three by three cells meanwhile."""
+    """Make EM run until it is cancelled, with a map of three by three cells meanwhile."""
 
     def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
         self.running = threading.Event()
@@ -41,8 +41,8 @@ class Endless:
         monkeypatch.setattr(em.Mapper, 'so_far', lambda mapper: (SO_FAR, np.ones(SO_FAR.shape, np.int8)))
 
 
-def asked(handler: Callable[[Any], None]) -> list[tuple[Any, ...]]:
-    """Call a service; its answer comes into the list."""
+def responses_of(handler: Callable[[Any], None]) -> list[tuple[Any, ...]]:
+    """Call a service and return the list that receives its response."""
     answers: list[tuple[Any, ...]] = []
     handler(SimpleNamespace(send=lambda *fields: answers.append(fields)))
     return answers
@@ -54,22 +54,22 @@ def width(robot: Inside) -> int:
 
 
 @pytest.mark.parametrize('online', [False, True])
-def test_it_ends_em_and_the_map_of_before_comes_back(
+def test_cancel_ends_em_and_restores_the_earlier_map(
     inside: Callable[..., Inside], monkeypatch: pytest.MonkeyPatch, online: bool
 ) -> None:
     robot = inside(publish_rate=50.0, online=online).start()
     node = robot.node
     robot.drive(0, 30)
     assert robot.call(node.em.run_em)[0]
-    # of EM, or the online map that goes on from there
+    # the map of EM, or the online map that continues from it
     robot.until(lambda: width(robot) > 3)
     wide, maps, before = width(robot), node.em.maps, node.maps.latest['ml_map'].data
     with monkeypatch.context() as patch:
         endless = Endless(patch)
-        first = asked(node.em.run_em)
+        first = responses_of(node.em.run_em)
         robot.until(lambda: endless.running.is_set() and width(robot) == 3)
-        # both who wait for the end are told
-        answers = [asked(node.em.cancel), asked(node.em.cancel)]
+        # both callers that wait for the end get a response
+        answers = [responses_of(node.em.cancel), responses_of(node.em.cancel)]
         robot.until(lambda: first and all(answers))
     assert first == [(False, 'EM was cancelled by cancel_em')]
     for ((success, message),) in answers:
@@ -84,14 +84,14 @@ def test_it_ends_em_and_the_map_of_before_comes_back(
     assert robot.call(node.em.run_em)[0]
 
 
-def test_without_an_earlier_map_an_empty_one_comes(
+def test_cancel_without_an_earlier_map_publishes_an_empty_one(
     inside: Callable[..., Inside], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     robot = inside(publish_rate=50.0).start()
     node = robot.node
     robot.drive(0, 5)
     endless = Endless(monkeypatch)
-    saved = asked(node.saver.save_maps)
+    saved = responses_of(node.saver.save_maps)
     robot.until(lambda: endless.running.is_set() and width(robot) == 3)
     assert robot.call(node.em.cancel)[0]
     robot.until(lambda: saved)
@@ -99,26 +99,28 @@ def test_without_an_earlier_map_an_empty_one_comes(
     assert width(robot) == 1
 
 
-def test_a_reset_says_that_it_was_the_reset(inside: Callable[..., Inside], monkeypatch: pytest.MonkeyPatch) -> None:
+def test_reset_is_named_as_the_cause_of_the_cancellation(
+    inside: Callable[..., Inside], monkeypatch: pytest.MonkeyPatch
+) -> None:
     robot = inside().start()
     node = robot.node
     robot.drive(0, 5)
     endless = Endless(monkeypatch)
-    first = asked(node.em.run_em)
+    first = responses_of(node.em.run_em)
     robot.until(endless.running.is_set)
-    cancelled = asked(node.em.cancel)
+    cancelled = responses_of(node.em.cancel)
     assert robot.call(node.reset)[0]
     robot.until(lambda: first and cancelled)
     assert first == [(False, 'EM was cancelled by reset')]
     assert cancelled[0][1].startswith('EM was cancelled by reset (after ')
 
 
-def test_there_is_nothing_to_cancel(inside: Callable[..., Inside]) -> None:
+def test_cancel_without_a_run_fails(inside: Callable[..., Inside]) -> None:
     robot = inside().start()
     assert robot.call(robot.node.em.cancel) == (False, 'EM is not running: there is nothing to cancel')
 
 
-def test_maps_that_were_found_already_stay(inside: Callable[..., Inside], monkeypatch: pytest.MonkeyPatch) -> None:
+def test_cancel_after_the_search_keeps_its_maps(inside: Callable[..., Inside], monkeypatch: pytest.MonkeyPatch) -> None:
     robot = inside().start()
     node = robot.node
     robot.drive(0, 30)
@@ -131,18 +133,16 @@ def test_maps_that_were_found_already_stay(inside: Callable[..., Inside], monkey
         return judge(maps)
 
     monkeypatch.setattr(em, 'sensor_health', slow)
-    first = asked(node.em.run_em)
+    first = responses_of(node.em.run_em)
     robot.until(found.is_set)
-    cancelled = asked(node.em.cancel)
+    cancelled = responses_of(node.em.cancel)
     go_on.set()
     robot.until(lambda: first and cancelled)
     assert first[0][0] and node.em.maps is not None
     assert cancelled == [(False, 'EM ended before it could be cancelled; its maps are published')]
 
 
-def test_an_em_that_fails_by_itself_brings_the_map_back_too(
-    inside: Callable[..., Inside], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_failing_em_restores_the_earlier_map(inside: Callable[..., Inside], monkeypatch: pytest.MonkeyPatch) -> None:
     robot = inside(publish_rate=50.0).start()
     node = robot.node
     robot.drive(0, 30)
@@ -150,14 +150,14 @@ def test_an_em_that_fails_by_itself_brings_the_map_back_too(
     wide = width(robot)
 
     def run(mapper: Mapper, readings: Any, watch: Any, start: Any) -> None:
-        # it is shown as often as `publish_rate` has it
+        # the map is shown at publish_rate
         while width(robot) != 3:
             watch('search', Progress(1, 2, 3, 4.0))
         raise MemoryError
 
     monkeypatch.setattr(em.Mapper, 'run', run)
     monkeypatch.setattr(em.Mapper, 'so_far', lambda mapper: (SO_FAR, np.ones(SO_FAR.shape, np.int8)))
-    first = asked(node.em.run_em)
+    first = responses_of(node.em.run_em)
     robot.until(lambda: first)
     assert not first[0][0] and 'memory' in first[0][1]
     assert width(robot) == wide

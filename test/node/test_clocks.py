@@ -1,4 +1,4 @@
-"""What the node says of clocks that jump, or that are behind each other."""
+"""Warnings about clocks that jump, or that differ."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from forward_grid_mapper.node.frames import MapFrame, Transforms
 
 @pytest.fixture
 def clock(monkeypatch: pytest.MonkeyPatch) -> Any:
-    """The clock of the node, which the test moves."""
+    """The clock of the node, set by the test."""
     made = SimpleNamespace(now=1000.0)
     monkeypatch.setattr(clocks.time, 'monotonic', lambda: made.now)
     return made
@@ -32,7 +32,7 @@ def taking() -> Taking:
     return robot
 
 
-def test_two_sources_of_odometry_whose_clocks_differ_are_told_of_now_and_then(clock: Any) -> None:
+def test_two_odometry_sources_with_different_clocks_give_rare_warnings(clock: Any) -> None:
     robot = taking()
     for k in range(100):
         clock.now += 0.05
@@ -49,7 +49,7 @@ def test_two_sources_of_odometry_whose_clocks_differ_are_told_of_now_and_then(cl
     assert faults(robot) == []
 
 
-def test_a_bag_that_begins_anew_is_no_fault(clock: Any) -> None:
+def test_restarted_bag_is_no_fault(clock: Any) -> None:
     robot = taking()
     for _ in range(AGAIN + 2):
         clock.now += 0.6 * LASTING
@@ -66,19 +66,19 @@ def test_a_bag_that_begins_anew_is_no_fault(clock: Any) -> None:
 
 
 def faults(robot: Taking) -> list[str]:
-    """What is said of stamps; the messages of this test have no numbers, so that losses are guessed."""
+    """Faults about stamps; messages here have no sequence numbers, so lost ones are estimated."""
     return [fault for fault in robot.intake.faults() if 'stamps' in fault]
 
 
 def drive(robot: Taking, seconds: int, late: float, *frames: str, first: int = 0) -> None:
-    """Ten readings a second, whose stamps are so late."""
+    """Ten readings a second, with stamps that are late by `late` seconds."""
     for k in range(10 * first, 10 * (first + seconds)):
         robot.odometry(1000.0 + 0.1 * k)
         for frame in frames:
             robot.range(1000.0 + 0.1 * k - late, frame)
 
 
-def test_a_sensor_whose_clock_stays_behind_is_told_of(clock: Any) -> None:
+def test_sensor_with_a_late_clock_gives_a_warning(clock: Any) -> None:
     robot = taking()
     drive(robot, 20, 0.0, 'sonar')
     assert faults(robot) == []
@@ -91,14 +91,14 @@ def test_a_sensor_whose_clock_stays_behind_is_told_of(clock: Any) -> None:
     assert robot.node.warned == [fault]
     drive(robot, 6, 20.0, 'right', 'left', first=26)
     assert 'right (and 1 sensor more) are 20.0 s behind' in faults(robot)[0]
-    # set right, or silent
+    # the left clock is correct again, or the sensor is silent
     drive(robot, 6, 0.0, 'left', first=32)
     assert 'the stamps of right are' in faults(robot)[0]
     drive(robot, 6, 0.0, 'left', first=38)
     assert faults(robot) == []
 
 
-def test_a_sensor_whose_clock_is_ahead_is_told_of_and_odometry_that_is_rare_is_none(clock: Any) -> None:
+def test_sensor_with_a_clock_ahead_gives_a_warning(clock: Any) -> None:
     robot = taking()
     drive(robot, 6, -2.0, 'sonar')
     (fault,) = faults(robot)
@@ -111,7 +111,7 @@ def test_a_sensor_whose_clock_is_ahead_is_told_of_and_odometry_that_is_rare_is_n
     assert faults(rare) == []
 
 
-def test_sensors_on_both_sides_are_told_of_apart(clock: Any) -> None:
+def test_late_and_early_sensors_give_separate_warnings(clock: Any) -> None:
     robot = taking()
     for k in range(60):
         robot.odometry(1000.0 + 0.1 * k)
@@ -123,9 +123,9 @@ def test_sensors_on_both_sides_are_told_of_apart(clock: Any) -> None:
     assert robot.node.warned == [behind, ahead]
 
 
-def test_odometry_that_waits_for_tf_makes_no_sensor_ahead(clock: Any) -> None:
+def test_odometry_that_waits_for_tf_gives_no_warning_of_clocks(clock: Any) -> None:
     class Late(Transforms):
-        """TF that has everything 1.5 s later."""
+        """TF that delivers transforms 1.5 s late."""
 
         now = 0.0
 
@@ -143,8 +143,8 @@ def test_odometry_that_waits_for_tf_makes_no_sensor_ahead(clock: Any) -> None:
     assert faults(robot) == []
 
 
-def test_a_queue_that_is_worked_off_is_not_behind(clock: Any) -> None:
-    """Odometry that is taken before the ranges that came with it."""
+def test_queue_of_messages_gives_no_warning_of_clocks(clock: Any) -> None:
+    """Odometry is processed before the ranges that came with it."""
     robot = taking()
     for k in range(200):
         robot.odometry(1000.0 + 0.1 * k)
@@ -155,7 +155,7 @@ def test_a_queue_that_is_worked_off_is_not_behind(clock: Any) -> None:
     assert faults(robot) == []
 
 
-def test_a_stamp_that_nobody_filled_in_is_no_clock_that_is_behind(clock: Any) -> None:
+def test_stamps_of_zero_give_no_warning_of_clocks(clock: Any) -> None:
     robot = taking()
     for k in range(100):
         robot.odometry(1000.0 + 0.1 * k)
@@ -164,7 +164,7 @@ def test_a_stamp_that_nobody_filled_in_is_no_clock_that_is_behind(clock: Any) ->
     assert robot.associator.rejected == {'zero_stamp': 100}
 
 
-def test_after_a_jump_back_a_sensor_is_looked_at_anew(clock: Any) -> None:
+def test_jump_back_of_time_clears_the_warning(clock: Any) -> None:
     robot = taking()
     drive(robot, 6, 10.0, 'sonar', first=100)
     assert faults(robot)

@@ -1,4 +1,4 @@
-"""What is wrong with the node's command line, said in words and never by a traceback."""
+"""Errors on the node's command line are reported without a traceback."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from forward_grid_mapper.core.common.errors import MapperError
 from forward_grid_mapper.node import complaints
 
 
-def refused(domain: int, *arguments: str, **changes: str) -> tuple[int, str]:
+def rejected(domain: int, *arguments: str, **changes: str) -> tuple[int, str]:
     command = [sys.executable, '-m', 'forward_grid_mapper', 'mapper', *arguments]
     done = subprocess.run(
         command, capture_output=True, text=True, timeout=120, check=False, env={**environment(domain), **changes}
@@ -41,22 +41,22 @@ def refused(domain: int, *arguments: str, **changes: str) -> tuple[int, str]:
         (['--ros-args', '-p', 'journal:=~nobody_of_this_name/x'], 1, 'there is no user nobody_of_this_name'),
     ],
 )
-def test_what_cannot_be_is_refused(domain: int, arguments: list[str], code: int, expected: str) -> None:
-    found, said = refused(domain, *arguments)
-    assert expected in said
+def test_bad_arguments_are_rejected_with_reason(domain: int, arguments: list[str], code: int, expected: str) -> None:
+    found, message = rejected(domain, *arguments)
+    assert expected in message
     assert found == code
 
 
 @pytest.mark.parametrize('number', ['5000', 'home', '1.5'])
-def test_a_domain_that_there_is_not(domain: int, number: str) -> None:
-    assert refused(domain, ROS_DOMAIN_ID=number) == (
+def test_invalid_domain_is_rejected(domain: int, number: str) -> None:
+    assert rejected(domain, ROS_DOMAIN_ID=number) == (
         1,
         f'ROS_DOMAIN_ID is {number}, not a whole number from 0 to 232',
     )
 
 
 @pytest.mark.parametrize('number', ['', ' ', '0', '232', '+7'])
-def test_domains_that_there_are(number: str) -> None:
+def test_valid_domains_are_accepted(number: str) -> None:
     assert complaints.of_domain({'ROS_DOMAIN_ID': number}) == '' == complaints.of_domain({})
 
 
@@ -73,7 +73,7 @@ def test_domains_that_there_are(number: str) -> None:
         (['--params-file', 'x.yaml'], '--params-file must be after --ros-args: --ros-args --params-file x.yaml'),
     ],
 )
-def test_arguments_that_ros_does_not_take(arguments: list[str], expected: str) -> None:
+def test_argument_that_ros_rejects_has_a_message(arguments: list[str], expected: str) -> None:
     assert expected in complaints.of_arguments(arguments)
 
 
@@ -85,7 +85,7 @@ def test_arguments_that_ros_does_not_take(arguments: list[str], expected: str) -
         ('odd', 'odd: no such ROS option; known are --param,'),
     ],
 )
-def test_options_that_ros_does_not_know(text: str, expected: str) -> None:
+def test_unknown_ros_option_has_a_message(text: str, expected: str) -> None:
     assert expected in complaints.of_ros_arguments(text)
 
 
@@ -116,7 +116,7 @@ def test_options_that_ros_does_not_know(text: str, expected: str) -> None:
         ('', "RuntimeError('')"),
     ],
 )
-def test_what_rclpy_says_is_told_without_its_sources(text: str, expected: str) -> None:
+def test_error_of_rclpy_is_reported_without_source_lines(text: str, expected: str) -> None:
     assert complaints.of_ros(RuntimeError(text)).startswith(expected)
 
 
@@ -136,18 +136,16 @@ def test_what_rclpy_says_is_told_without_its_sources(text: str, expected: str) -
         ),
     ],
 )
-def test_what_is_wrong_with_a_parameter_file_is_told_with_a_remedy(
-    tmp_path: Path, text: str, why: str, expected: str
-) -> None:
+def test_error_in_a_parameter_file_has_a_remedy(tmp_path: Path, text: str, why: str, expected: str) -> None:
     file = tmp_path / 'my.yaml'
     file.write_text(text)
-    said = complaints.of_ros(
+    message = complaints.of_ros(
         RuntimeError(f"Couldn't parse params file: '--params-file {file}'. Error: {why}, at /a.c:1")
     )
-    assert said.startswith(f'--params-file {file}: ') and expected in said
+    assert message.startswith(f'--params-file {file}: ') and expected in message
 
 
-def test_save_directory_of_a_user_who_is_not_there(domain: int, tmp_path: Path) -> None:
+def test_save_directory_of_an_unknown_user_fails_on_save(domain: int, tmp_path: Path) -> None:
     robot = Inside(domain, tmp_path, save_directory='~nobody_of_this_name/maps').start()
     try:
         robot.drive(0, 10)
@@ -160,8 +158,8 @@ def test_save_directory_of_a_user_who_is_not_there(domain: int, tmp_path: Path) 
         robot.close()
 
 
-def test_no_range_topic_at_all(domain: int, tmp_path: Path) -> None:
-    """ROS takes no empty list on a command line, but a launch file in Python may give one."""
+def test_empty_list_of_range_topics_is_rejected(domain: int, tmp_path: Path) -> None:
+    """ROS accepts no empty list on a command line, but a launch file in Python may contain one."""
     robot = Inside(domain, tmp_path)
     try:
         node: Any = robot.node.parameters.node

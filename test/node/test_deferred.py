@@ -1,4 +1,4 @@
-"""Answers that come later than the handler returns, or sooner: each caller gets one, by the header of his call."""
+"""Service responses that are sent later or at once: each call gets one, with the header of its request."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from forward_grid_mapper.node.deferred import CALLS, DeferredService, Reply
 
 
 class Serving:
-    """As much of a node as a service needs; `call` does what rclpy's executor does with a request."""
+    """Stand-in for a node, with what a service needs; `call` processes a request like the executor of rclpy."""
 
     def __init__(self) -> None:
         self.sent: list[tuple[Any, Any]] = []
@@ -36,7 +36,7 @@ class Serving:
         self.service.send_response(self.callback(request, Trigger.Response()), header)
 
 
-def test_an_answer_goes_out_when_it_is_there_whoever_is_first() -> None:
+def test_responses_are_sent_when_ready_in_any_order() -> None:
     node, replies = Serving(), list[Reply]()
     DeferredService(node, Trigger, 'later', replies.append)
     for header in ('first', 'second'):
@@ -54,7 +54,7 @@ def test_an_answer_goes_out_when_it_is_there_whoever_is_first() -> None:
     assert [(r.message, header) for r, header in at_once.sent] == [('at once', 'third')]
 
 
-def test_nobody_is_answered_twice() -> None:
+def test_second_response_to_a_call_is_ignored() -> None:
     node, replies = Serving(), list[Reply]()
     DeferredService(node, Trigger, 'later', replies.append)
     node.call('one')
@@ -72,7 +72,7 @@ def test_nobody_is_answered_twice() -> None:
     assert [r.message for r, _ in node.sent] == ['a']
 
 
-def test_the_handler_has_the_request() -> None:
+def test_handler_gets_the_request() -> None:
     node, seen = Serving(), list[bool]()
 
     def handle(reply: Reply) -> None:
@@ -85,7 +85,7 @@ def test_the_handler_has_the_request() -> None:
     assert CALLS.depth > 10, 'what ROS keeps by itself'
 
 
-def test_a_handler_that_fails_keeps_nobody_waiting() -> None:
+def test_failing_handler_responds_with_the_error() -> None:
     def fail(reply: Reply) -> None:
         raise KeyError('odd')
 
@@ -99,12 +99,12 @@ def test_a_handler_that_fails_keeps_nobody_waiting() -> None:
     ((response, header),) = node.sent
     assert (response.success, response.message, header) == (False, "it failed: KeyError('odd')", 'one')
     assert "KeyError('odd')" in node.logged[0] and 'Traceback' in node.logged[0]
-    # a response without words is the empty one
+    # a response type without message gets an empty response
     node = Serving()
     DeferredService(node, GetMap, 'get', fail)
     node.call('two')
     assert node.sent == [(GetMap.Response(), 'two')]
-    # who was answered already is not answered again
+    # a call with a response does not get a second one
     node = Serving()
     DeferredService(node, Trigger, 'late', fail_late)
     node.call('three')
@@ -112,7 +112,7 @@ def test_a_handler_that_fails_keeps_nobody_waiting() -> None:
     assert 'there is not enough memory' in node.logged[0]
 
 
-def test_who_still_waits_is_told_when_the_service_ends() -> None:
+def test_waiting_calls_fail_when_the_service_ends() -> None:
     node, replies = Serving(), list[Reply]()
     service = DeferredService(node, Trigger, 'later', replies.append)
     for header in ('first', 'second'):
@@ -123,7 +123,7 @@ def test_who_still_waits_is_told_when_the_service_ends() -> None:
         (True, 'done', 'first'),
         (False, 'it ends', 'second'),
     ]
-    # an answer that comes too late goes nowhere
+    # later responses are dropped
     replies[1].send(True, 'done')
     service.end('it ends')
     assert len(node.sent) == 2 and not service.open

@@ -1,4 +1,4 @@
-"""The service run_em and who waits with it: each caller gets one answer, and the maps of the latest run are kept."""
+"""The service run_em and calls that wait for it: each gets one response, and the maps of the latest run are kept."""
 
 from __future__ import annotations
 
@@ -40,12 +40,12 @@ def robot(make: Callable[..., EmRobot]) -> EmRobot:
 
 @pytest.fixture
 def held(robot: EmRobot) -> EmRobot:
-    """Searches wait until the test lets them go on."""
+    """Searches wait until the test lets them continue."""
     robot.held = True
     return robot
 
 
-def test_maps_are_published_and_kept_and_the_caller_is_told(robot: EmRobot) -> None:
+def test_maps_are_published_and_kept_and_the_call_succeeds(robot: EmRobot) -> None:
     robot.warnings, robot.trajectory.words = ['ranges are copies'], 'trajectory refined'
     assert (robot.em.last_run, robot.em.explained, robot.em.maps) == ('none yet', 0, None)
     answer = robot.run_em()
@@ -68,7 +68,7 @@ def test_maps_are_published_and_kept_and_the_caller_is_told(robot: EmRobot) -> N
     assert robot.searches[0].start is None
 
 
-def test_a_run_looks_at_what_was_accepted_when_it_began_thinned_to_the_bound(make: Callable[..., EmRobot]) -> None:
+def test_run_uses_thinned_readings_accepted_at_its_start(make: Callable[..., EmRobot]) -> None:
     robot = make(count=40, max_readings=38)
     robot.held = True
     robot.run_em()
@@ -78,7 +78,7 @@ def test_a_run_looks_at_what_was_accepted_when_it_began_thinned_to_the_bound(mak
     assert robot.searches[0].count == 38 and robot.em.explained == 40
 
 
-def test_what_comes_while_kernels_are_compiled_is_mapped_as_well(robot: EmRobot) -> None:
+def test_readings_received_during_compilation_are_mapped(robot: EmRobot) -> None:
     robot.compiled.clear()
     answer = robot.run_em()
     robot.until(lambda: robot.waited)
@@ -91,7 +91,7 @@ def test_what_comes_while_kernels_are_compiled_is_mapped_as_well(robot: EmRobot)
     assert answer.sent[0][1].startswith('8 readings') and robot.em.explained == 8
 
 
-def test_what_comes_while_those_of_the_trajectory_are_compiled_is_mapped_too(make: Callable[..., EmRobot]) -> None:
+def test_readings_received_during_compilation_of_refinement_are_mapped(make: Callable[..., EmRobot]) -> None:
     robot = make(refine_poses=True)
     robot.compiled.discard('trajectory')
     answer = robot.run_em()
@@ -102,7 +102,7 @@ def test_what_comes_while_those_of_the_trajectory_are_compiled_is_mapped_too(mak
     assert answer.sent[0][1].startswith('8 readings') and robot.em.explained == 8
 
 
-def test_time_in_which_kernels_are_compiled_is_told_apart(robot: EmRobot) -> None:
+def test_compilation_time_is_reported_separately(robot: EmRobot) -> None:
     robot.compiled.clear()
     answer, begin = robot.run_em(), time.monotonic()
     robot.until(lambda: time.monotonic() - begin > 0.6)
@@ -116,14 +116,14 @@ def test_time_in_which_kernels_are_compiled_is_told_apart(robot: EmRobot) -> Non
     assert 'compiled' not in quick.sent[0][1]
 
 
-def test_kernels_of_the_trajectory_are_waited_for_where_one_is_found(make: Callable[..., EmRobot]) -> None:
+def test_run_with_refine_poses_waits_for_its_kernels(make: Callable[..., EmRobot]) -> None:
     robot = make(refine_poses=True)
     robot.run_em()
     robot.settle()
     assert robot.waited == ['EM', 'trajectory']
 
 
-def test_a_second_call_is_refused_while_one_goes_on(held: EmRobot) -> None:
+def test_second_call_during_a_run_fails(held: EmRobot) -> None:
     first, second = held.run_em(), held.run_em()
     ((success, message),) = second.sent
     assert (
@@ -136,7 +136,7 @@ def test_a_second_call_is_refused_while_one_goes_on(held: EmRobot) -> None:
     assert first.sent[0][0] and len(held.searches) == 1
 
 
-def test_a_run_by_itself_begins_where_there_are_readings_and_none_goes_on(make: Callable[..., EmRobot]) -> None:
+def test_automatic_run_needs_readings_and_no_other_run(make: Callable[..., EmRobot]) -> None:
     assert not make(count=0).em.run_by_itself()
     robot = make()
     robot.held = True
@@ -147,7 +147,7 @@ def test_a_run_by_itself_begins_where_there_are_readings_and_none_goes_on(make: 
     assert robot.em.maps is not None
 
 
-def test_a_call_joins_a_run_by_itself_that_is_fresh(held: EmRobot) -> None:
+def test_call_joins_an_automatic_run_with_all_readings(held: EmRobot) -> None:
     held.em.run_by_itself()
     held.begun()
     answer = held.run_em()
@@ -159,7 +159,7 @@ def test_a_call_joins_a_run_by_itself_that_is_fresh(held: EmRobot) -> None:
 
 
 @pytest.mark.parametrize('why', ['readings', 'parameters'])
-def test_a_run_by_itself_that_is_old_gives_way(held: EmRobot, why: str) -> None:
+def test_outdated_automatic_run_is_replaced_by_a_call(held: EmRobot, why: str) -> None:
     held.em.run_by_itself()
     held.begun()
     waiting = held.wait_for_maps()
@@ -180,7 +180,7 @@ def test_a_run_by_itself_that_is_old_gives_way(held: EmRobot, why: str) -> None:
     assert held.em.explained == (7 if why == 'readings' else 5)
 
 
-def test_who_waits_for_a_run_that_cannot_begin_is_told(held: EmRobot, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_calls_fail_if_the_run_cannot_begin(held: EmRobot, monkeypatch: pytest.MonkeyPatch) -> None:
     held.em.run_by_itself()
     held.begun()
     held.accept(1)
@@ -199,7 +199,7 @@ def test_who_waits_for_a_run_that_cannot_begin_is_told(held: EmRobot, monkeypatc
     assert held.run_em().sent == [] and held.em.current is not None
 
 
-def test_cancelling_is_answered_when_the_run_has_ended(held: EmRobot) -> None:
+def test_cancel_responds_when_the_run_has_ended(held: EmRobot) -> None:
     ((success, message),) = held.cancel_em().sent
     assert (success, message) == (False, 'EM is not running: there is nothing to cancel')
     answer = held.run_em()
@@ -216,7 +216,7 @@ def test_cancelling_is_answered_when_the_run_has_ended(held: EmRobot) -> None:
     assert held.published == [], 'nothing was shown meanwhile'
 
 
-def test_cancelling_too_late_says_so(held: EmRobot, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_cancel_after_the_end_of_the_search_fails(held: EmRobot, monkeypatch: pytest.MonkeyPatch) -> None:
     answer = held.run_em()
     search = held.begun()
     monkeypatch.setattr(search, 'cancel', search.go_on.set)
@@ -226,7 +226,7 @@ def test_cancelling_too_late_says_so(held: EmRobot, monkeypatch: pytest.MonkeyPa
     assert cancelled.sent == [(False, 'EM ended before it could be cancelled; its maps are published')]
 
 
-def test_who_goes_before_a_run_is_told_when_it_is_cancelled(held: EmRobot) -> None:
+def test_call_that_replaces_a_run_fails_if_it_is_cancelled(held: EmRobot) -> None:
     held.em.run_by_itself()
     held.begun()
     held.accept(1)
@@ -239,7 +239,7 @@ def test_who_goes_before_a_run_is_told_when_it_is_cancelled(held: EmRobot) -> No
     assert cancelled.sent[0][0] and len(held.searches) == 1
 
 
-def test_a_reset_forgets_the_maps_and_ends_the_run(held: EmRobot) -> None:
+def test_reset_deletes_the_maps_and_cancels_the_run(held: EmRobot) -> None:
     held.run_em()
     held.begun().go_on.set()
     held.settle()
@@ -258,7 +258,7 @@ def test_a_reset_forgets_the_maps_and_ends_the_run(held: EmRobot) -> None:
     assert em.last_run == 'EM was cancelled by reset' and em.maps is None and len(held.searches) == 2
 
 
-def test_maps_that_a_reset_overtakes_are_not_kept(held: EmRobot, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_maps_of_a_run_before_a_reset_are_not_kept(held: EmRobot, monkeypatch: pytest.MonkeyPatch) -> None:
     answer = held.run_em()
     search = held.begun()
     monkeypatch.setattr(search, 'cancel', search.go_on.set)
@@ -269,7 +269,7 @@ def test_maps_that_a_reset_overtakes_are_not_kept(held: EmRobot, monkeypatch: py
     assert all(generation == 3 for _, generation, *_ in held.published), 'publishers drop what is of before'
 
 
-def test_who_asks_for_maps_has_those_that_there_are_or_waits(held: EmRobot) -> None:
+def test_caller_gets_existing_maps_or_waits_for_the_run(held: EmRobot) -> None:
     first = held.wait_for_maps()
     second = held.wait_for_maps()
     held.begun().go_on.set()
@@ -281,7 +281,7 @@ def test_who_asks_for_maps_has_those_that_there_are_or_waits(held: EmRobot) -> N
     assert again.maps is held.em.maps and len(held.searches) == 1
 
 
-def test_the_map_of_before_comes_back_where_a_run_that_was_shown_fails(make: Callable[..., EmRobot]) -> None:
+def test_failing_run_restores_the_earlier_map(make: Callable[..., EmRobot]) -> None:
     robot = make(publish_rate=50.0)
     robot.held, robot.error = True, MemoryError()
     answer = robot.run_em()
@@ -297,7 +297,7 @@ def test_the_map_of_before_comes_back_where_a_run_that_was_shown_fails(make: Cal
     assert robot.published[-1] == ('ml_map', 3, *BEFORE)
 
 
-def test_the_map_so_far_is_shown_as_often_as_publish_rate_has_it(make: Callable[..., EmRobot]) -> None:
+def test_intermediate_map_is_published_at_publish_rate(make: Callable[..., EmRobot]) -> None:
     robot = make(publish_rate=20.0)
     robot.held = True
     robot.run_em()
@@ -309,7 +309,7 @@ def test_the_map_so_far_is_shown_as_often_as_publish_rate_has_it(make: Callable[
         search.watch('search', PROGRESS)
     assert 0.15 <= time.monotonic() - begin < 10.0
     assert any('3 nats' in text or 'iteration 1' in text for text in robot.node.warned)
-    # not where there is none, nor while it is being cancelled
+    # no map if the search has none, nor while it is being cancelled
     robot.so_far = None
     end = time.monotonic() + 0.12
     while time.monotonic() < end:
@@ -321,7 +321,7 @@ def test_the_map_so_far_is_shown_as_often_as_publish_rate_has_it(make: Callable[
     assert len([1 for name, *_ in robot.published if name == 'ml_map']) == 5, 'the map of before'
 
 
-def test_a_long_stage_without_a_map_is_told_of_now_and_then(held: EmRobot, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_long_stage_without_a_map_is_logged_repeatedly(held: EmRobot, monkeypatch: pytest.MonkeyPatch) -> None:
     held.run_em()
     search, run = held.begun(), held.em.current
     assert run is not None
@@ -338,7 +338,7 @@ def test_a_long_stage_without_a_map_is_told_of_now_and_then(held: EmRobot, monke
     assert all('trajectory of 5 readings' in text for text in held.node.warned) and held.published == []
 
 
-def test_maps_along_a_trajectory_are_shown_together_with_it(robot: EmRobot) -> None:
+def test_maps_are_published_after_their_trajectory_is_adopted(robot: EmRobot) -> None:
     robot.trajectory.on = True
     robot.held = True
     robot.run_em()
@@ -349,7 +349,7 @@ def test_maps_along_a_trajectory_are_shown_together_with_it(robot: EmRobot) -> N
     robot.settle()
     assert robot.trajectory.adopted == [(None, 5)]
     assert [name for name, *_ in robot.published] == ['ml_map', 'uncertainty_map']
-    # what was forgotten meanwhile is not adopted
+    # a trajectory of before a reset is not adopted
     robot.run_em()
     search = robot.begun()
     search.cancel = search.go_on.set  # type: ignore[method-assign]
@@ -359,7 +359,7 @@ def test_maps_along_a_trajectory_are_shown_together_with_it(robot: EmRobot) -> N
     assert len(robot.trajectory.adopted) == 1 and len(robot.published) == 2
 
 
-def test_a_run_gives_its_trajectory_the_drive_and_what_there_is_by_now(held: EmRobot) -> None:
+def test_run_gives_the_refiner_the_drive_and_newer_readings(held: EmRobot) -> None:
     held.run_em()
     held.begun()
     held.accept(4)
@@ -382,12 +382,12 @@ def online_map(start: Any) -> Any:
     return SimpleNamespace(so_far=lambda: start, adopt=calls.append, show=lambda: calls.append('show'), calls=calls)
 
 
-def test_the_online_map_gives_the_start_and_takes_what_is_found(robot: EmRobot) -> None:
+def test_run_starts_from_the_online_map_and_updates_it(robot: EmRobot) -> None:
     robot.em.online = online = online_map('the map so far')
     robot.run_em()
     robot.settle()
     assert robot.searches[0].start == 'the map so far' and online.calls == [robot.em.maps]
-    # along another trajectory it is not where odometry has it
+    # not along another trajectory, since the online map is at the poses of odometry
     robot.trajectory.correction = object()
     robot.error = MemoryError()
     robot.run_em()
@@ -395,14 +395,14 @@ def test_the_online_map_gives_the_start_and_takes_what_is_found(robot: EmRobot) 
     assert robot.searches[1].start is None and online.calls[1:] == ['show']
 
 
-def test_contradictions_are_looked_for_after_the_answer_and_told_of(robot: EmRobot) -> None:
+def test_contradictions_are_checked_after_the_response_and_logged(robot: EmRobot) -> None:
     robot.warnings, robot.contradictions = ['copies'], ['stamps are late', 'mirrored']
     robot.run_em()
     robot.settle()
     assert robot.checked == [(5, {'sonar': (0.1, 0.0, 0.0)})]
     assert robot.em.wrong_input == ['copies', 'stamps are late', 'mirrored']
     assert robot.node.warned[-2:] == ['EM: stamps are late', 'EM: mirrored']
-    # of maps that were forgotten, or came after, nothing is told
+    # nothing is logged about deleted maps, or about maps that have been replaced
     robot.node.warned.clear()
     for forget in ('maps', 'generation'):
         robot.em._check_consistency(robot.em.maps, {}, 3)  # type: ignore[arg-type]
@@ -424,7 +424,7 @@ def test_closing_cancels_the_run(held: EmRobot) -> None:
 
 
 @pytest.mark.parametrize(
-    ('received', 'rejected', 'said'),
+    ('received', 'rejected', 'expected'),
     [
         (0, {}, 'no Range message has been received on /sonar, /left since'),
         (7, {}, '7 readings have been received, and wait for their poses'),
@@ -432,8 +432,8 @@ def test_closing_cancels_the_run(held: EmRobot) -> None:
         (9, {'nan_range': 2, 'below_min_range': 7}, '7 of 9 readings were rejected as below_min_range: the range is'),
     ],
 )
-def test_why_there_is_nothing_to_map(
-    make: Callable[..., EmRobot], received: int, rejected: dict[str, int], said: str
+def test_run_without_readings_fails_with_reason(
+    make: Callable[..., EmRobot], received: int, rejected: dict[str, int], expected: str
 ) -> None:
     robot = make(count=0)
     robot.em.range_topics = ['/sonar', '/left']
@@ -443,11 +443,11 @@ def test_why_there_is_nothing_to_map(
     answer = robot.run_em()
     robot.settle()
     ((success, message),) = answer.sent
-    assert not success and message.startswith('there is nothing to map: ') and said in message
+    assert not success and message.startswith('there is nothing to map: ') and expected in message
 
 
-def test_without_any_odometry_that_is_what_there_is_to_be_told(make: Callable[..., EmRobot]) -> None:
-    for came, refused, said in (
+def test_run_without_odometry_fails_with_that_reason(make: Callable[..., EmRobot]) -> None:
+    for came, refused, expected in (
         (0, {}, 'no Odometry message has been received on /wheels since the start or reset'),
         (8, {'long_frame_id': 3, 'bad_pose': 5}, 'all 8 odometry messages were rejected as bad_pose: the pose is not'),
         (9, {'bad_pose': 5}, '6 of 9 readings were rejected as no_odometry: odometry, or its transform'),
@@ -461,12 +461,12 @@ def test_without_any_odometry_that_is_what_there_is_to_be_told(make: Callable[..
         answer = robot.run_em()
         robot.settle()
         ((success, message),) = answer.sent
-        assert not success and message.startswith(f'there is nothing to map: {said}')
+        assert not success and message.startswith(f'there is nothing to map: {expected}')
 
 
-def test_odometry_that_waits_for_a_localiser_is_not_called_missing(make: Callable[..., EmRobot]) -> None:
+def test_odometry_waiting_for_a_localiser_is_named_as_the_reason(make: Callable[..., EmRobot]) -> None:
     lack = 'TF has no transform from map (map_frame) to odom'
-    for came, rejected, said in (
+    for came, rejected, expected in (
         (0, {'no_odometry': 9}, lack),
         (0, {}, lack),
         (0, {'nan_range': 9}, '9 of 9 readings were rejected as nan_range'),
@@ -480,19 +480,19 @@ def test_odometry_that_waits_for_a_localiser_is_not_called_missing(make: Callabl
         answer = robot.run_em()
         robot.settle()
         ((_, message),) = answer.sent
-        assert message.startswith(f'there is nothing to map: {said}')
+        assert message.startswith(f'there is nothing to map: {expected}')
 
 
-def test_a_call_that_waits_for_kernels_is_logged_as_such(robot: EmRobot) -> None:
-    said = 'run_em waits for the compilation of kernels, as at the first start'
+def test_call_that_waits_for_kernels_is_logged(robot: EmRobot) -> None:
+    line = 'run_em waits for the compilation of kernels, as at the first start'
     robot.compiled.clear()
     robot.run_em()
-    assert robot.node.warned == [said]
-    # one that is refused does not wait
+    assert robot.node.warned == [line]
+    # a rejected call does not wait
     assert robot.run_em().sent[0][1].startswith('EM is already running')
-    assert robot.node.warned == [said]
+    assert robot.node.warned == [line]
     robot.compiled.add('EM')
     robot.settle()
     robot.run_em()
     robot.settle()
-    assert robot.node.warned.count(said) == 1
+    assert robot.node.warned.count(line) == 1

@@ -1,4 +1,4 @@
-"""EM in the background: however a run ends, whoever waits gets an answer, and the next one can begin."""
+"""EM in the background: after any end of a run, all callers get a response and the next run can begin."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ READING = Readings.from_columns(names=('sonar',), x=0.0, y=0.0, yaw=0.0, z=[1.0]
 
 
 class Caller:
-    """The thread that owns a worker, as the executor does in the node."""
+    """The thread that owns a worker, like the executor of the node."""
 
     def __init__(self) -> None:
         self.logged: list[str] = []
@@ -34,7 +34,7 @@ class Caller:
         return self.worker.start(Run(Mapper(Parameters()), Parameters(), lambda: readings), done)
 
     def conclude(self) -> None:
-        # the first one compiles kernels, on a machine that may have other work
+        # the first run compiles kernels, on a machine that may be busy
         self._conclusions.get(timeout=240.0)()
 
     def outcome_of(self, readings: Readings = READING) -> Outcome:
@@ -55,7 +55,7 @@ def caller() -> Iterator[Caller]:
     ('error', 'reported'),
     [(MemoryError(), 'does not fit into the memory'), (ValueError('odd'), "EM failed: ValueError('odd')")],
 )
-def test_a_run_that_fails_says_why_and_the_next_begins(
+def test_failing_run_gives_a_reason_and_the_next_begins(
     monkeypatch: pytest.MonkeyPatch, caller: Caller, error: Exception, reported: str
 ) -> None:
     def fail(*arguments: Any) -> None:
@@ -71,7 +71,7 @@ def test_a_run_that_fails_says_why_and_the_next_begins(
 
 @pytest.mark.parametrize('where', ['map_grid', 'shortage', 'sensor_health', 'input_warnings', 'Outcome'])
 @pytest.mark.parametrize('error', [MemoryError(), KeyError('odd'), SystemExit(3)])
-def test_whatever_raises_wherever_an_answer_comes(
+def test_error_at_any_place_gives_an_outcome(
     monkeypatch: pytest.MonkeyPatch, caller: Caller, where: str, error: BaseException
 ) -> None:
     failing = [True]
@@ -95,7 +95,7 @@ def test_whatever_raises_wherever_an_answer_comes(
     assert caller.outcome_of().maps is not None
 
 
-def test_a_thread_that_cannot_start_is_an_answer(monkeypatch: pytest.MonkeyPatch, caller: Caller) -> None:
+def test_failed_start_of_the_thread_gives_an_outcome(monkeypatch: pytest.MonkeyPatch, caller: Caller) -> None:
     def fail(self: threading.Thread) -> None:
         raise RuntimeError("can't start new thread")
 
@@ -107,12 +107,12 @@ def test_a_thread_that_cannot_start_is_an_answer(monkeypatch: pytest.MonkeyPatch
     assert caller.worker.worker.trouble == ''
 
 
-def test_a_run_that_cannot_fit_does_not_begin(monkeypatch: pytest.MonkeyPatch, caller: Caller) -> None:
+def test_run_without_enough_memory_does_not_begin(monkeypatch: pytest.MonkeyPatch, caller: Caller) -> None:
     monkeypatch.setattr(em, 'shortage', lambda cells, readings, threads: 'there is no space')
     assert caller.outcome_of() == Outcome(None, 'there is no space')
 
 
-def test_what_is_wrong_with_the_readings_comes_with_the_maps(caller: Caller) -> None:
+def test_warnings_about_readings_come_with_the_maps(caller: Caller) -> None:
     steps = np.repeat(np.arange(50), 2)
     twice = Readings.from_columns(
         names=('sonar',),
@@ -131,7 +131,7 @@ def test_what_is_wrong_with_the_readings_comes_with_the_maps(caller: Caller) -> 
     assert caller.outcome_of().warnings == []
 
 
-def test_maps_are_shown_before_sensors_are_judged(monkeypatch: pytest.MonkeyPatch, caller: Caller) -> None:
+def test_maps_are_published_before_sensors_are_judged(monkeypatch: pytest.MonkeyPatch, caller: Caller) -> None:
     order: list[str] = []
     monkeypatch.setattr(em, 'sensor_health', lambda maps: order.append('judged') or {})
     run = Run(Mapper(Parameters()), Parameters(), lambda: READING, lambda maps: order.append('shown'))
@@ -141,7 +141,7 @@ def test_maps_are_shown_before_sensors_are_judged(monkeypatch: pytest.MonkeyPatc
 
 
 class Slow:
-    """A run that goes on until it is cancelled, and then for as long as the test likes."""
+    """A run that continues until it is cancelled, and then until the test lets it end."""
 
     def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
         self.begun, self.cancelled, self.may_end = threading.Event(), threading.Event(), threading.Event()
@@ -157,13 +157,13 @@ class Slow:
         raise Cancelled('cancelled')
 
 
-def test_no_second_run_begins_while_the_first_one_lives(monkeypatch: pytest.MonkeyPatch, caller: Caller) -> None:
+def test_second_run_does_not_begin_before_the_end_of_the_first(monkeypatch: pytest.MonkeyPatch, caller: Caller) -> None:
     slow, outcomes = Slow(monkeypatch), []
     assert caller.begin(outcomes.append)
     assert slow.begun.wait(60.0)
     assert not caller.begin(outcomes.append)
     caller.worker.cancel()
-    # being cancelled is not having ended
+    # a cancelled run has not ended yet
     assert slow.cancelled.wait(60.0)
     assert not caller.begin(outcomes.append)
     slow.may_end.set()
@@ -174,24 +174,24 @@ def test_no_second_run_begins_while_the_first_one_lives(monkeypatch: pytest.Monk
     caller.conclude()
 
 
-def test_who_cannot_be_told_of_the_maps_is_told_that_it_failed(caller: Caller) -> None:
-    told: list[tuple[str, Outcome]] = []
+def test_caller_that_fails_with_the_maps_gets_a_failure(caller: Caller) -> None:
+    outcomes: list[tuple[str, Outcome]] = []
 
     def odd(outcome: Outcome) -> None:
-        told.append(('odd', outcome))
+        outcomes.append(('odd', outcome))
         if outcome.maps is not None:
             raise KeyError('odd')
 
-    def deaf(outcome: Outcome) -> None:
+    def failing(outcome: Outcome) -> None:
         raise MemoryError
 
     assert caller.begin(odd)
     assert caller.worker.current is not None
-    caller.worker.current.waiting += [deaf, lambda outcome: told.append(('last', outcome))]
+    caller.worker.current.waiting += [failing, lambda outcome: outcomes.append(('last', outcome))]
     caller.conclude()
-    assert [name for name, _ in told] == ['odd', 'odd', 'last']
-    assert told[1][1].maps is None and "KeyError('odd')" in told[1][1].message
-    assert told[2][1].maps is not None
+    assert [name for name, _ in outcomes] == ['odd', 'odd', 'last']
+    assert outcomes[1][1].maps is None and "KeyError('odd')" in outcomes[1][1].message
+    assert outcomes[2][1].maps is not None
     assert len(caller.logged) == 2
 
 
@@ -208,7 +208,7 @@ def test_closing_cancels_and_waits_for_the_end(monkeypatch: pytest.MonkeyPatch, 
     assert slow.ended
 
 
-def test_a_run_that_waits_for_kernels_can_be_cancelled() -> None:
+def test_run_that_waits_for_kernels_can_be_cancelled() -> None:
     conclusions: queue.Queue[Callable[[], None]] = queue.Queue()
     waits = threading.Event()
 
@@ -229,7 +229,7 @@ def test_a_run_that_waits_for_kernels_can_be_cancelled() -> None:
     assert outcomes[0].message == 'EM was cancelled'
 
 
-def test_a_run_says_where_it_stands(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_text_of_a_run_has_its_progress(monkeypatch: pytest.MonkeyPatch) -> None:
     run = Run(Mapper(Parameters()), Parameters(), lambda: READING)
     monkeypatch.setattr(em.time, 'monotonic', lambda: run.begin + 12.34)
     assert run.seconds == pytest.approx(12.34)
@@ -242,11 +242,11 @@ def test_a_run_says_where_it_stands(monkeypatch: pytest.MonkeyPatch) -> None:
     assert str(run).endswith(' nats gained, being cancelled')
 
 
-def test_a_run_in_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_summary_of_a_run_is_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
     statistics = {'iterations': 7, 'flips': 8, 'shifts': 9, 'occupied': 10, 'converged': True}
     maps: Any = SimpleNamespace(statistics=statistics, readings=range(5), log_likelihood=-1.25, objective=-2.5)
-    said: list[str] = []
-    monkeypatch.setattr(em, 'quality_warning', lambda maps: ''.join(said))
+    warnings: list[str] = []
+    monkeypatch.setattr(em, 'quality_warning', lambda maps: ''.join(warnings))
     line = (
         '5 readings, 10 occupied cells, 3.21 seconds '
         '(7 iterations, 8 flips, 9 shifts, log-likelihood -1.2, objective -2.5)'
@@ -254,18 +254,18 @@ def test_a_run_in_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
     assert em.summary(maps, 3.21) == line
     statistics['converged'] = False
     assert em.summary(maps, 3.21) == f'{line}; NOT converged: raise max_iterations'
-    said.append('it does not fit')
+    warnings.append('it does not fit')
     assert em.summary(maps, 3.21) == f'{line}; NOT converged: raise max_iterations; WARNING: it does not fit'
 
 
 @pytest.mark.parametrize(('threads', 'expected'), [(0, 6), (2, 2)])
-def test_memory_is_asked_for_as_many_threads_as_there_will_be(
+def test_memory_check_uses_the_number_of_threads(
     monkeypatch: pytest.MonkeyPatch, caller: Caller, threads: int, expected: int
 ) -> None:
-    asked: list[tuple[int, int]] = []
+    requested: list[tuple[int, int]] = []
     monkeypatch.setattr(em, 'cores', lambda: 6)
-    monkeypatch.setattr(em, 'shortage', lambda cells, count, cores: asked.append((count, cores)) or 'too much')
+    monkeypatch.setattr(em, 'shortage', lambda cells, count, cores: requested.append((count, cores)) or 'too much')
     parameters, outcomes = Parameters.from_flat({'threads': threads}), list[Outcome]()
     assert caller.worker.start(Run(Mapper(parameters), parameters, lambda: READING), outcomes.append)
     caller.conclude()
-    assert asked == [(1, expected)] and outcomes == [Outcome(None, 'too much')]
+    assert requested == [(1, expected)] and outcomes == [Outcome(None, 'too much')]

@@ -1,4 +1,4 @@
-"""Faults around the node: processes that die or stop, memory that runs out, disks that are full."""
+"""Faults around the node: processes that die or stop, lack of memory, and full disks."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ def memory(process: NodeProcess, key: str) -> int:
 
 
 @pytest.mark.slow
-def test_callers_that_die_or_come_all_at_once(start: Any, robot: Robot, domain: int, tmp_path: Path) -> None:
+def test_callers_that_die_or_call_all_at_once(start: Any, robot: Robot, domain: int, tmp_path: Path) -> None:
     folder = journal_of(tmp_path / 'journal', corridor_drive(0).readings)
     start(*OPTIONS, '-p', f'journal:={folder}', '-p', 'resolution:=0.04')
     robot.meet()
@@ -74,17 +74,17 @@ def test_callers_that_die_or_come_all_at_once(start: Any, robot: Robot, domain: 
 
 
 @pytest.mark.slow
-def test_memory_that_runs_out_fails_the_call_and_nothing_else(start: Any, robot: Robot, tmp_path: Path) -> None:
+def test_lack_of_memory_fails_only_the_call(start: Any, robot: Robot, tmp_path: Path) -> None:
     readings = corridor_drive(0).readings.select(slice(None, 4000))
     folder = journal_of(tmp_path / 'journal', readings)
     node = start(*OPTIONS, '-p', f'journal:={folder}', '-p', 'resolution:=0.02')
     robot.meet()
     robot.sent = 4000
     robot.play(circle(0, 50))
-    # the compiler takes more than the limit leaves
+    # compilation needs more than the limit leaves
     robot.until(lambda: robot.diagnostics.get('background', {}).get('message') == 'no fault', what='all is compiled')
     free = memory(node, 'VmSize:')
-    # enough for all that the node does, and less than EM takes at the least
+    # enough for all work of the node, and less than the least that EM needs
     limit = memory(node, 'VmSize:') + (50 << 20)
     resource.prlimit(node.process.pid, resource.RLIMIT_AS, (limit, resource.RLIM_INFINITY))
     answer = robot.call('run_em')
@@ -99,7 +99,7 @@ def test_memory_that_runs_out_fails_the_call_and_nothing_else(start: Any, robot:
     assert memory(node, 'VmSize:') < free + (2 << 30)
 
 
-def test_a_node_that_is_stopped_for_a_while_catches_up(start: Any, robot: Robot) -> None:
+def test_node_stopped_for_some_time_catches_up(start: Any, robot: Robot) -> None:
     node = start(*OPTIONS)
     robot.meet()
     robot.play(circle(0, 50))
@@ -113,7 +113,7 @@ def test_a_node_that_is_stopped_for_a_while_catches_up(start: Any, robot: Robot)
 
 
 @pytest.mark.slow
-def test_a_subscriber_that_never_reads_stops_nobody(start: Any, robot: Robot, domain: int) -> None:
+def test_subscriber_that_never_reads_blocks_nothing(start: Any, robot: Robot, domain: int) -> None:
     start(*OPTIONS)
     robot.meet()
     with bystander(domain, 'listen', '/forward_grid_mapper/live_map') as listener:
@@ -134,7 +134,7 @@ def test_a_subscriber_that_never_reads_stops_nobody(start: Any, robot: Robot, do
 
 
 @pytest.mark.slow
-def test_publishers_that_go_and_come_back(start: Any, domain: int) -> None:
+def test_restarted_publishers_are_received(start: Any, domain: int) -> None:
     start(*OPTIONS)
     watcher = Robot(domain)
     try:
@@ -159,7 +159,7 @@ def small_disk(tmp_path: Path) -> Iterator[Path]:
     subprocess.run(['umount', '-l', str(folder)], check=False)
 
 
-def test_a_full_disk_is_a_warning_and_nothing_is_half_written(start: Any, robot: Robot, small_disk: Path) -> None:
+def test_full_disk_gives_a_warning_and_no_incomplete_files(start: Any, robot: Robot, small_disk: Path) -> None:
     ballast = small_disk / 'ballast'
     options = ('-p', f'journal:={small_disk}/journal', '-p', f'save_directory:={small_disk}/maps')
     node = start(*OPTIONS, *options)

@@ -1,4 +1,4 @@
-"""The node with `refine_poses` and `online`: map to odom follows while the robot drives."""
+"""The node with `refine_poses` and `online`: the transform from map to odom is updated while the robot drives."""
 
 from __future__ import annotations
 
@@ -24,8 +24,8 @@ from forward_grid_mapper.node import refining
 OK, WARN = b'\x00', b'\x01'
 
 
-class Told:
-    """A bent drive in parts, and a refiner that is told where the robot really was."""
+class DriftingDrive:
+    """A drive with drift in parts, and a refiner that knows the true poses."""
 
     def __init__(self) -> None:
         self.recording = bent_drive()
@@ -36,20 +36,22 @@ class Told:
         self.parts = [messages[begin:end] for begin, end in itertools.pairwise(cuts)]
 
     def off(self, robot: Inside) -> float:
-        """Metres by which the robot's newest pose on the map is off."""
+        """Error in metres of the newest pose of the robot on the map."""
         correction, odometry = robot.node.trajectory.correction, odometry_of(robot)
         path = correction.extended(odometry.stamp, odometry.pose)
         return float(np.hypot(*(path.pose[-1] - self.true.at(path.stamp[-1:])[0])[:2]))
 
 
 @pytest.fixture(scope='module')
-def told() -> Told:
-    return Told()
+def drifting() -> DriftingDrive:
+    return DriftingDrive()
 
 
 @pytest.fixture
-def driving(inside: Callable[..., Inside], told: Told, monkeypatch: pytest.MonkeyPatch) -> Callable[..., Inside]:
-    """Begin the drive, and run EM after the first part of it."""
+def driving(
+    inside: Callable[..., Inside], drifting: DriftingDrive, monkeypatch: pytest.MonkeyPatch
+) -> Callable[..., Inside]:
+    """Begin the drive, and run EM after its first part."""
 
     class Knows:
         def __init__(self, parameters: Any) -> None:
@@ -59,15 +61,15 @@ def driving(inside: Callable[..., Inside], told: Told, monkeypatch: pytest.Monke
             pass
 
         def run(self, readings: Any, odometry: Odometry, watch: Any) -> Refinement:
-            path = Odometry(odometry.stamp, told.true.at(odometry.stamp))
+            path = Odometry(odometry.stamp, drifting.true.at(odometry.stamp))
             return Refinement(True, 'told', replaced(readings, odometry, path), path, {}, 1.0, 0.2, 3, 0.1)
 
     monkeypatch.setattr(refining, 'Refiner', Knows)
-    mounts = {f'sensors.{frame}.pose': list(map(float, pose)) for frame, pose in told.recording.extrinsics}
+    mounts = {f'sensors.{frame}.pose': list(map(float, pose)) for frame, pose in drifting.recording.extrinsics}
 
     def begin(**options: Any) -> Inside:
         robot = inside(**{'refine_poses': True, 'online': True, **mounts, **options}).start()
-        robot.hand(told.parts[0])
+        robot.hand(drifting.parts[0])
         assert robot.call(robot.node.em.run_em)[0]
         return robot
 
@@ -75,7 +77,7 @@ def driving(inside: Callable[..., Inside], told: Told, monkeypatch: pytest.Monke
 
 
 def follow(robot: Inside, least: int = 1) -> Follower:
-    """Turn the executor until so many windows are followed and nothing is left to do."""
+    """Turn the executor until `least` windows are followed and no work is left."""
     part = robot.node.trajectory.following
     assert part is not None
 
@@ -83,7 +85,7 @@ def follow(robot: Inside, least: int = 1) -> Follower:
         return not part.worker.waiting and not part._busy
 
     robot.until(lambda: part.follower is not None and idle())
-    # what it was offered last may have lacked some of what the robot has by now
+    # the last offer may have lacked some of the newest messages
     part._seen = None
     robot.until(lambda: (part._seen is not None or part.obstacle) and idle())
     assert part.follower.windows >= least
@@ -91,8 +93,8 @@ def follow(robot: Inside, least: int = 1) -> Follower:
     return follower
 
 
-def test_map_to_odom_follows_while_the_robot_drives(
-    driving: Callable[..., Inside], told: Told, monkeypatch: pytest.MonkeyPatch
+def test_map_to_odom_is_updated_while_the_robot_drives(
+    driving: Callable[..., Inside], drifting: DriftingDrive, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     by, follow_on = set(), Follower.follow
 
@@ -104,42 +106,42 @@ def test_map_to_odom_follows_while_the_robot_drives(
     robot = driving()
     node = robot.node
     base = node.trajectory.correction
-    robot.hand(told.parts[1])
+    robot.hand(drifting.parts[1])
     follower = follow(robot, 10)
     assert node.trajectory.correction is follower.correction
-    assert told.off(robot) < 0.35
+    assert drifting.off(robot) < 0.35
     kept = np.hypot(*(base.last - node.trajectory.correction.last)[:2])
     assert kept > 0.3, 'the correction has moved on'
     assert node.em.found.correction is base, 'what the run found stays'
     values = robot.status('trajectory')
     assert values['followed since the latest run'].startswith(f'{follower.windows} windows')
     assert values['level'] == OK
-    robot.hand(told.parts[2])
+    robot.hand(drifting.parts[2])
     follow(robot, follower.windows + 5)
-    assert told.off(robot) < 0.35
+    assert drifting.off(robot) < 0.35
     assert by and threading.get_ident() not in by, 'the executor does not do it'
-    # what comes goes into the maps where it is followed to
+    # later readings are mapped along the followed trajectory
     readings = node.associator.readings
     placed, odometry = node.trajectory.place(readings), odometry_of(robot)
-    right = replaced(readings, odometry, Odometry(odometry.stamp, told.true.at(odometry.stamp)))
+    right = replaced(readings, odometry, Odometry(odometry.stamp, drifting.true.at(odometry.stamp)))
     assert np.hypot(placed.x - right.x, placed.y - right.y).max() < 0.35
     assert not node.live.worker.trouble
     assert not node.trajectory.following.worker.trouble
-    # the whole is looked at anew
+    # the whole drive is refined again
     assert robot.call(node.em.run_em)[0]
     assert node.trajectory.following.follower is not follower
-    assert told.off(robot) < 0.1
+    assert drifting.off(robot) < 0.1
 
 
-def test_what_is_driven_while_a_run_goes_on_is_followed_when_it_ends(
-    driving: Callable[..., Inside], told: Told, monkeypatch: pytest.MonkeyPatch
+def test_part_driven_during_a_run_is_followed_at_its_end(
+    driving: Callable[..., Inside], drifting: DriftingDrive, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     robot = driving()
     before = robot.node.trajectory.following.follower
     held = HeldRun(monkeypatch)
     answer = robot.begin(robot.node.em.run_em)
     robot.until(held.begun.is_set)
-    robot.hand(told.parts[1])
+    robot.hand(drifting.parts[1])
     follow(robot, 10)
     assert robot.node.trajectory.following.follower is before, 'the one before goes on meanwhile'
     held.go_on.set()
@@ -149,28 +151,28 @@ def test_what_is_driven_while_a_run_goes_on_is_followed_when_it_ends(
     assert after is not before
     assert after.windows >= 10, 'it is where the robot is as soon as it is in force'
     assert robot.node.trajectory.correction is after.correction
-    assert told.off(robot) < 0.35
+    assert drifting.off(robot) < 0.35
 
 
-def test_it_follows_neither_without_online_nor_when_refine_poses_is_off(
-    driving: Callable[..., Inside], told: Told
-) -> None:
+def test_following_needs_online_and_refine_poses(driving: Callable[..., Inside], drifting: DriftingDrive) -> None:
     robot = driving(online=False)
     base = robot.node.trajectory.correction
     assert robot.node.trajectory.following is None
-    robot.hand(told.parts[1])
+    robot.hand(drifting.parts[1])
     robot.spin(0.3)
     assert robot.node.trajectory.correction is base
     other = driving()
     base = other.node.trajectory.correction
     other.set(refine_poses=False)
-    other.hand(told.parts[1])
+    other.hand(drifting.parts[1])
     other.spin(0.3)
     assert other.node.trajectory.correction is base
     assert other.node.trajectory.following.follower.windows == 0
 
 
-def test_reset_ends_it(driving: Callable[..., Inside], told: Told, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_reset_ends_following(
+    driving: Callable[..., Inside], drifting: DriftingDrive, monkeypatch: pytest.MonkeyPatch
+) -> None:
     robot = driving()
     begun, go_on = threading.Event(), threading.Event()
     follow_on = Follower.follow
@@ -181,7 +183,7 @@ def test_reset_ends_it(driving: Callable[..., Inside], told: Told, monkeypatch: 
         return follow_on(self, *arguments)
 
     monkeypatch.setattr(Follower, 'follow', waits)
-    robot.hand(told.parts[1])
+    robot.hand(drifting.parts[1])
     robot.until(begun.is_set)
     assert robot.call(robot.node.reset)[0]
     go_on.set()
@@ -194,27 +196,29 @@ def test_reset_ends_it(driving: Callable[..., Inside], told: Told, monkeypatch: 
     assert 'followed since the latest run' not in robot.status('trajectory')
 
 
-def test_it_goes_on_after_a_pause_and_other_parameters(driving: Callable[..., Inside], told: Told) -> None:
+def test_following_continues_after_a_pause_and_other_parameters(
+    driving: Callable[..., Inside], drifting: DriftingDrive
+) -> None:
     robot = driving()
-    half = len(told.parts[1]) // 2
+    half = len(drifting.parts[1]) // 2
     request = type('Request', (), {'data': True})()
     robot.call(robot.node.pause, request)
-    robot.hand(told.parts[1][:half])
+    robot.hand(drifting.parts[1][:half])
     robot.spin(0.2)
     follower = robot.node.trajectory.following.follower
     assert follower.windows == 0, 'windows wait for readings'
     request.data = False
     robot.call(robot.node.pause, request)
     robot.set(p_hit=0.6, publish_rate=5.0)
-    robot.hand(told.parts[1][half:])
+    robot.hand(drifting.parts[1][half:])
     assert follow(robot, 10) is follower
     assert not follower.obstacle
     assert robot.node.trajectory.correction is follower.correction
 
 
-def test_a_node_that_follows_can_be_ended(driving: Callable[..., Inside], told: Told) -> None:
+def test_node_can_be_closed_while_following(driving: Callable[..., Inside], drifting: DriftingDrive) -> None:
     robot = driving()
-    robot.hand(told.parts[1])
+    robot.hand(drifting.parts[1])
     part = robot.node.trajectory.following
     robot.until(lambda: part.worker.waiting or part.follower.windows)
     robot.close()
@@ -222,8 +226,8 @@ def test_a_node_that_follows_can_be_ended(driving: Callable[..., Inside], told: 
 
 
 @pytest.mark.parametrize('when', ['driving', 'in a run'])
-def test_a_fault_ends_it_until_the_next_run(
-    driving: Callable[..., Inside], told: Told, monkeypatch: pytest.MonkeyPatch, when: str
+def test_error_ends_following_until_the_next_run(
+    driving: Callable[..., Inside], drifting: DriftingDrive, monkeypatch: pytest.MonkeyPatch, when: str
 ) -> None:
     robot = driving()
     node, warned = robot.node, []
@@ -231,8 +235,8 @@ def test_a_fault_ends_it_until_the_next_run(
         node.trajectory.following, '_log', type('Log', (), {'warning': lambda self, text: warned.append(text)})()
     )
     base = node.trajectory.correction
-    # the first windows fail, and whatever comes after them has to be searched through by the run at the end
-    first = len(told.parts[1]) // 4
+    # the first windows fail, and the run at the end has to examine all that comes after them
+    first = len(drifting.parts[1]) // 4
 
     def fails(self: Follower, *arguments: Any) -> bool:
         raise MemoryError
@@ -242,7 +246,7 @@ def test_a_fault_ends_it_until_the_next_run(
         if when == 'in a run':
             assert robot.call(node.em.run_em)[0], 'the maps are as good without'
             base = node.trajectory.correction
-        robot.hand(told.parts[1][:first])
+        robot.hand(drifting.parts[1][:first])
         robot.until(lambda: node.trajectory.following.obstacle)
         robot.until(lambda: warned)
         robot.until(lambda: not node.trajectory.following.worker.waiting)
@@ -251,12 +255,12 @@ def test_a_fault_ends_it_until_the_next_run(
     status = robot.status('trajectory')
     assert status['level'] == WARN
     assert 'ended: there is not enough memory' in status['followed since the latest run']
-    # where it fails in a run, the one before may have failed during it too
-    said = list(warned)
-    assert len(said) == 1 or (when == 'in a run' and said == [said[0]] * 2)
-    robot.hand(told.parts[1][first : first + 100])
+    # if following fails in a run, the earlier follower may have failed during the run as well
+    logged = list(warned)
+    assert len(logged) == 1 or (when == 'in a run' and logged == [logged[0]] * 2)
+    robot.hand(drifting.parts[1][first : first + 100])
     robot.spin(0.2)
-    assert warned == said
+    assert warned == logged
     assert robot.call(node.em.run_em)[0]
     assert not node.trajectory.following.obstacle
     assert robot.status('trajectory')['level'] == OK

@@ -1,4 +1,4 @@
-"""The part of the node that follows: one window of work at a time, and nothing of a follower that was given up."""
+"""Following in the node: one piece of work at a time, and no results of a follower that was replaced."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ HERE, THERE = Pose2(0.0, 0.0, 0.0), Pose2(1.0, 0.0, 0.0)
 
 
 class PlainFollower:
-    """Follows when the test lets it."""
+    """Stand-in for a follower that waits for the test."""
 
     def __init__(self, obstacle: str = '') -> None:
         self.obstacle, self.windows, self.places, self.kept = obstacle, 0, 2, False
@@ -46,7 +46,7 @@ class PlainFollower:
 
 
 class Driving:
-    """The executor, and what the part told it."""
+    """The executor, and the corrections it received."""
 
     def __init__(self) -> None:
         self.node, self.corrections = PlainNode(), list[Any]()
@@ -71,7 +71,7 @@ def driving() -> Driving:
     return Driving()
 
 
-def test_what_there_is_is_followed_where_the_robot_has_moved(driving: Driving) -> None:
+def test_readings_are_followed_when_the_robot_has_moved(driving: Driving) -> None:
     driving.offer(HERE)
     assert driving.part.obstacle == '' and driving.part.values() == {}
     follower = driving.begin(PlainFollower())
@@ -88,7 +88,7 @@ def test_what_there_is_is_followed_where_the_robot_has_moved(driving: Driving) -
     assert driving.node.warned == []
 
 
-def test_one_piece_at_a_time(driving: Driving) -> None:
+def test_one_piece_of_work_at_a_time(driving: Driving) -> None:
     follower = driving.begin(PlainFollower(), at_once=False)
     driving.offer(HERE)
     assert follower.begun.wait(60.0)
@@ -105,7 +105,7 @@ def test_one_piece_at_a_time(driving: Driving) -> None:
 
 
 @pytest.mark.parametrize(('error', 'why'), [(MemoryError(), 'there is not enough memory'), (KeyError('odd'), 'odd')])
-def test_a_fault_ends_it_and_is_told(driving: Driving, error: BaseException, why: str) -> None:
+def test_error_ends_following_and_is_reported(driving: Driving, error: BaseException, why: str) -> None:
     follower = driving.begin(PlainFollower())
     follower.error = error
     driving.offer(HERE)
@@ -118,7 +118,7 @@ def test_a_fault_ends_it_and_is_told(driving: Driving, error: BaseException, why
     driving.offer(THERE)
     driving.settle()
     assert len(follower.seen) == 1
-    # the next run brings another follower, which begins where the robot stands
+    # the next run brings another follower, which begins at the current pose
     other = driving.begin(PlainFollower())
     assert driving.part.obstacle == '' and follower.cancelled
     driving.offer(HERE)
@@ -126,7 +126,7 @@ def test_a_fault_ends_it_and_is_told(driving: Driving, error: BaseException, why
     assert other.windows == 1
 
 
-def test_a_drive_that_cannot_be_had_is_asked_for_again(driving: Driving) -> None:
+def test_failed_copy_of_the_drive_is_retried(driving: Driving) -> None:
     follower = driving.begin(PlainFollower())
 
     def fails() -> Any:
@@ -139,7 +139,7 @@ def test_a_drive_that_cannot_be_had_is_asked_for_again(driving: Driving) -> None
     assert follower.windows == 1
 
 
-def test_an_obstacle_that_is_there_at_the_begin_is_told_at_once(driving: Driving) -> None:
+def test_obstacle_at_the_begin_is_reported_at_once(driving: Driving) -> None:
     driving.begin(PlainFollower('the clock jumped'))
     assert 'the clock jumped' in driving.node.warned[0]
     driving.offer(HERE)
@@ -147,7 +147,7 @@ def test_an_obstacle_that_is_there_at_the_begin_is_told_at_once(driving: Driving
 
 
 @pytest.mark.parametrize('end', ['another', 'none', 'cancel'])
-def test_nothing_is_taken_from_a_follower_that_was_given_up(driving: Driving, end: str) -> None:
+def test_results_of_a_replaced_follower_are_dropped(driving: Driving, end: str) -> None:
     before, other = driving.begin(PlainFollower(), at_once=False), PlainFollower()
     driving.offer(HERE)
     assert before.begun.wait(60.0)
@@ -166,7 +166,7 @@ def test_nothing_is_taken_from_a_follower_that_was_given_up(driving: Driving, en
         assert driving.part.follower is None
 
 
-def test_what_was_found_a_moment_before_the_end_is_not_taken(driving: Driving) -> None:
+def test_result_just_before_the_replacement_is_dropped(driving: Driving) -> None:
     before = driving.begin(PlainFollower())
     driving.offer(HERE)
     driving.part.worker.ask(lambda: None)
@@ -175,7 +175,7 @@ def test_what_was_found_a_moment_before_the_end_is_not_taken(driving: Driving) -
     assert other.begun.wait(60.0)
     driving.node.turn()
     assert before.windows == 1 and driving.corrections == []
-    # and the new one is still at work
+    # the new one is still working
     driving.offer(HERE)
     assert driving.part.worker.waiting == 1
     other.go_on.set()

@@ -1,4 +1,4 @@
-"""Sensor poses and the map frame from TF, with a buffer that stands in for tf2_ros'."""
+"""Sensor poses and the map frame from TF, with a stand-in for the buffer of tf2_ros."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ class TransformError(Exception):
 
 
 class LookupFailed(TransformError):
-    """A frame is not known."""
+    """A frame is unknown."""
 
 
 class ExtrapolationFailed(TransformError):
@@ -33,7 +33,7 @@ ExtrapolationFailed.__name__ = 'ExtrapolationException'
 
 
 def transform(x: float, y: float, yaw: float = 0.0, pitch: float = 0.0) -> Any:
-    """A `geometry_msgs/Transform`: first turned by yaw, then by pitch."""
+    """A `geometry_msgs/Transform`: a rotation by yaw, and then by pitch."""
     a, b = yaw / 2, pitch / 2
     rotation = SimpleNamespace(
         x=-math.sin(a) * math.sin(b),
@@ -45,19 +45,19 @@ def transform(x: float, y: float, yaw: float = 0.0, pitch: float = 0.0) -> Any:
 
 
 class Buffer:
-    """Answers as `tf2_ros.Buffer` does, without waiting."""
+    """Responds like `tf2_ros.Buffer`, without waiting."""
 
     def __init__(self) -> None:
         self.known: dict[tuple[str, str], Any] = {}
         self.until = 1 << 62
-        self.asked = 0
+        self.lookups = 0
 
     def clear(self) -> None:
-        """Forget what is not static; here nothing is."""
+        """Delete transforms that are not static, here all."""
         self.known.clear()
 
     def lookup_transform(self, target: str, source: str, time: Any) -> Any:
-        self.asked += 1
+        self.lookups += 1
         if (target, source) not in self.known:
             raise LookupFailed(source)
         if time.nanoseconds > self.until:
@@ -76,18 +76,18 @@ def transforms(buffer: Buffer) -> Transforms:
     return Transforms(buffer, TransformError)
 
 
-def test_parameters_win_over_tf(buffer: Buffer, transforms: Transforms) -> None:
+def test_pose_in_parameters_overrides_tf(buffer: Buffer, transforms: Transforms) -> None:
     buffer.known['base', 'sonar'] = transform(1.0, 2.0)
     assert Extrinsics({}, transforms)('base', 'sonar', 0) == Pose2(1.0, 2.0, 0.0)
     assert Extrinsics({'sonar': Pose2(3, 4, 5)}, transforms)('base', '/sonar', 0) == Pose2(3, 4, 5)
     assert Extrinsics({}, transforms)('/base', '/sonar', 0) == Pose2(1.0, 2.0, 0.0)
 
 
-def test_without_tf_an_unknown_frame_is_unknown_at_once() -> None:
+def test_unknown_frame_without_tf_is_unknown_at_once() -> None:
     assert Extrinsics({}, Transforms())('base', 'sonar', 0) is None
 
 
-def test_poses_are_projected_and_steep_sensors_refused(buffer: Buffer, transforms: Transforms) -> None:
+def test_poses_are_projected_and_steep_sensors_rejected(buffer: Buffer, transforms: Transforms) -> None:
     buffer.known['base', 'ahead'] = transform(1.0, 2.0, yaw=2.5, pitch=0.5)
     buffer.known['base', 'down'] = transform(0.0, 0.0, pitch=1.5)
     extrinsics = Extrinsics({}, transforms)
@@ -96,22 +96,20 @@ def test_poses_are_projected_and_steep_sensors_refused(buffer: Buffer, transform
     assert extrinsics.unusable == set()
 
 
-def test_a_frame_that_is_not_there_is_asked_for_only_now_and_then(
+def test_unknown_frame_is_looked_up_rarely(
     buffer: Buffer, transforms: Transforms, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     now = 0.0
     monkeypatch.setattr(frames.time, 'monotonic', lambda: now)
     extrinsics = Extrinsics({}, transforms)
     assert all(extrinsics('base', 'ghost', k) is LATER for k in range(50))
-    assert buffer.asked == 1
+    assert buffer.lookups == 1
     now += 1.0
     buffer.known['base', 'ghost'] = transform(1.0, 0.0)
     assert extrinsics('base', 'ghost', 99) == Pose2(1.0, 0.0, 0.0)
 
 
-def test_a_moving_sensor_is_taken_at_the_readings_stamp_even_if_tf_is_late(
-    buffer: Buffer, transforms: Transforms
-) -> None:
+def test_moving_sensor_has_its_pose_at_the_stamp_with_late_tf(buffer: Buffer, transforms: Transforms) -> None:
     buffer.known['base', 'servo'] = lambda stamp: transform(0.0, 0.0, yaw=stamp / NANOSECONDS)
     buffer.until = 0
     associator = PoseAssociator(Extrinsics({}, transforms))
@@ -126,7 +124,7 @@ def test_a_moving_sensor_is_taken_at_the_readings_stamp_even_if_tf_is_late(
     assert sorted(associator.readings.yaw) == pytest.approx([0.0, 0.1, 0.2, 0.3, 0.4])
 
 
-def test_odometry_is_given_in_the_map_frame_once_tf_knows_it(buffer: Buffer, transforms: Transforms) -> None:
+def test_odometry_is_converted_once_tf_has_the_map_frame(buffer: Buffer, transforms: Transforms) -> None:
     frame = MapFrame('map', transforms, timeout=1.0)
     first, second = (OdometryMessage(k * NANOSECONDS // 2, 'odom', 'base', Pose2(1.0, 0.0, 0.0)) for k in (0, 1))
     buffer.known['map', 'odom'] = transform(10.0, 5.0, yaw=math.pi / 2)
@@ -139,7 +137,7 @@ def test_odometry_is_given_in_the_map_frame_once_tf_knows_it(buffer: Buffer, tra
     assert ready[0].pose == pytest.approx((10.0, 6.0, math.pi / 2))
 
 
-def test_odometry_without_a_transform_is_dropped_after_the_timeout(buffer: Buffer, transforms: Transforms) -> None:
+def test_odometry_without_transform_is_dropped_after_the_timeout(buffer: Buffer, transforms: Transforms) -> None:
     frame = MapFrame('map', transforms, timeout=1.0)
     for k in range(10):
         assert frame.convert(OdometryMessage(k * NANOSECONDS, 'odom', 'base', Pose2(0, 0, 0))) == []
@@ -150,24 +148,24 @@ def test_odometry_without_a_transform_is_dropped_after_the_timeout(buffer: Buffe
 
 
 @pytest.mark.parametrize('name', ['', 'odom', '/odom'])
-def test_without_another_map_frame_odometry_passes(transforms: Transforms, name: str) -> None:
+def test_odometry_in_the_map_frame_is_unchanged(transforms: Transforms, name: str) -> None:
     message = OdometryMessage(0, 'odom', 'base', Pose2(0, 0, 0))
     assert MapFrame(name, transforms, 1.0).convert(message) == [message]
 
 
-def test_a_stamp_before_1970_is_no_error(buffer: Buffer, transforms: Transforms) -> None:
+def test_negative_stamp_gives_no_error(buffer: Buffer, transforms: Transforms) -> None:
     buffer.known['base_link', 'sonar'] = transform(0.1, 0.2)
     assert transforms.lookup('base_link', 'sonar', 5) is buffer.known['base_link', 'sonar']
     assert transforms.lookup('base_link', 'sonar', -5) is LATER
 
 
-def test_names_that_nobody_knows_are_not_remembered_for_ever(transforms: Transforms) -> None:
+def test_number_of_remembered_unknown_frames_is_bounded(transforms: Transforms) -> None:
     for k in range(2 * frames.MOST_MISSING):
         assert transforms.lookup('base_link', f'frame {k}', 5) is LATER
     assert len(transforms._missing) <= frames.MOST_MISSING + 1
 
 
-def test_odometry_that_overtakes_by_a_nanosecond_loses_nothing(buffer: Buffer, transforms: Transforms) -> None:
+def test_odometry_out_of_order_by_a_nanosecond_is_kept(buffer: Buffer, transforms: Transforms) -> None:
     frame = MapFrame('map', transforms, 2.0)
 
     def at(stamp: int) -> OdometryMessage:
@@ -181,14 +179,14 @@ def test_odometry_that_overtakes_by_a_nanosecond_loses_nothing(buffer: Buffer, t
     assert frame.dropped == 0
 
 
-def test_odometry_whose_clock_stands_still_does_not_pile_up(transforms: Transforms) -> None:
+def test_odometry_with_constant_stamps_is_bounded(transforms: Transforms) -> None:
     frame = MapFrame('map', transforms, 2.0)
     for _ in range(frames.MOST_HELD + 500):
         frame.convert(OdometryMessage(5, 'odom', 'base_link', Pose2(0.0, 0.0, 0.0)))
     assert frame.dropped == 500
 
 
-def test_transforms_of_before_a_jump_of_the_clock_are_forgotten(
+def test_jump_back_of_time_deletes_transforms(
     buffer: Buffer, transforms: Transforms, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(frames, 'PATIENCE', 0.0)
@@ -199,15 +197,15 @@ def test_transforms_of_before_a_jump_of_the_clock_are_forgotten(
         return OdometryMessage(round(seconds * NANOSECONDS), 'odom', 'base', Pose2(0.0, 0.0, 0.0))
 
     assert frame.convert(at(100.0))[0].pose == Pose2(1.0, 0.0, 0.0)
-    # late by less than a jump, as messages may be
+    # late by less than a jump, which is normal
     assert frame.convert(at(99.5))[0].pose == Pose2(1.0, 0.0, 0.0)
-    # the recording begins anew, and its transforms are not there yet
+    # the recording restarts, and its transforms are not there yet
     assert frame.convert(at(10.0)) == []
     buffer.known['map', 'odom'] = transform(5.0, 0.0)
     assert [m.pose for m in frame.convert(at(10.1))] == [Pose2(5.0, 0.0, 0.0)] * 2
 
 
-def test_the_extrinsics_are_asked_for_anew_after_a_jump_where_odometry_is_the_map_frame(
+def test_jump_back_of_time_renews_sensor_poses_in_the_odometry_frame(
     buffer: Buffer, transforms: Transforms, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(frames, 'PATIENCE', 0.0)
@@ -221,7 +219,7 @@ def test_the_extrinsics_are_asked_for_anew_after_a_jump_where_odometry_is_the_ma
     assert extrinsics('base', 'sonar', 1 * NANOSECONDS) == Pose2(0.2, 0.0, 0.0)
 
 
-def test_a_sensor_that_looks_back_is_fixed(buffer: Buffer, transforms: Transforms) -> None:
+def test_sensor_that_looks_back_is_fixed(buffer: Buffer, transforms: Transforms) -> None:
     """Rounding decides whether its yaw is 180 or -180 degrees."""
     yaws = iter((math.pi - 1e-12, -math.pi + 1e-12))
     buffer.known['base', 'rear'] = lambda stamp: transform(-0.1, 0.0, yaw=next(yaws))
@@ -231,7 +229,7 @@ def test_a_sensor_that_looks_back_is_fixed(buffer: Buffer, transforms: Transform
     assert set(extrinsics.fixed) == {'rear'}
 
 
-def test_sensors_that_turn_on_the_robot_are_not_fixed(buffer: Buffer, transforms: Transforms) -> None:
+def test_turning_sensors_are_not_fixed(buffer: Buffer, transforms: Transforms) -> None:
     extrinsics = Extrinsics({'given': Pose2(1.0, 2.0, 3.0)}, transforms)
     buffer.known['base', 'fixed'] = transform(0.1, 0.0)
     buffer.known['base', 'servo'] = lambda stamp: transform(0.1, 0.0, stamp / NANOSECONDS)
@@ -241,7 +239,7 @@ def test_sensors_that_turn_on_the_robot_are_not_fixed(buffer: Buffer, transforms
     assert extrinsics.fixed == {'given': Pose2(1.0, 2.0, 3.0), 'fixed': Pose2(0.1, 0.0, 0.0)}
 
 
-def test_a_transform_that_is_late_is_no_unknown_frame(buffer: Buffer, transforms: Transforms) -> None:
+def test_late_transform_has_another_reason_than_an_unknown_frame(buffer: Buffer, transforms: Transforms) -> None:
     buffer.known['base', 'servo'] = transform(0.1, 0.0)
     buffer.until = 0
     now = [0.0]
@@ -261,7 +259,7 @@ def test_a_transform_that_is_late_is_no_unknown_frame(buffer: Buffer, transforms
     assert associator.unknown_frames == {'ghost'}
 
 
-def test_a_frame_whose_transform_came_after_all_is_not_unknown_any_more(
+def test_frame_with_a_transform_is_removed_from_unknown_frames(
     buffer: Buffer, transforms: Transforms, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(frames, 'PATIENCE', 0.0)
@@ -276,14 +274,14 @@ def test_a_frame_whose_transform_came_after_all_is_not_unknown_any_more(
             buffer.known['base', 'sonar'] = transform(0.1, 0.0)
             buffer.until = 0
         if stamp == 7:
-            # it is known, though not at these stamps
+            # the frame is known, but not at these stamps
             assert associator.unknown_frames == set()
             buffer.until = 1 << 62
     assert associator.unknown_frames == set()
     assert len(associator.buffer) >= 3
 
 
-def test_a_map_frame_without_its_transform_is_named(
+def test_missing_transform_of_the_map_frame_is_reported(
     buffer: Buffer, transforms: Transforms, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     now = 100.0
@@ -301,7 +299,7 @@ def test_a_map_frame_without_its_transform_is_named(
     drive(2)
     assert 'TF has no transform from map (map_frame) to odom' in frame.fault()
     assert f'{frame.dropped} were dropped' in frame.fault() and frame.dropped
-    # nobody drives: no odometry is what is wrong now
+    # without odometry messages, missing odometry is the fault
     now += 10.0
     assert frame.fault() == ''
     drive(1)
@@ -312,7 +310,7 @@ def test_a_map_frame_without_its_transform_is_named(
     buffer.until = round(now * NANOSECONDS)
     drive(4)
     assert "TF's transform from map (map_frame) to odom arrives later than pose_timeout" in frame.fault()
-    # late as TF is, by a tenth of a second
+    # TF is late by a tenth of a second
     for _ in range(50):
         buffer.until = round(now * NANOSECONDS)
         now += 0.1
@@ -320,7 +318,7 @@ def test_a_map_frame_without_its_transform_is_named(
     assert frame.fault() == ''
 
 
-def test_a_map_frame_that_is_tilted_is_told_of_and_waited_for_by_nobody(
+def test_tilted_map_frame_is_reported_and_odometry_dropped(
     buffer: Buffer, transforms: Transforms, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     now = 100.0
@@ -337,7 +335,7 @@ def test_a_map_frame_that_is_tilted_is_told_of_and_waited_for_by_nobody(
     assert placed.pose == Pose2(1.0, 0.0, 0.0) and frame.found and not frame.fault()
 
 
-def test_the_lookup_says_whether_a_frame_or_a_time_is_missing(buffer: Buffer, transforms: Transforms) -> None:
+def test_lookup_distinguishes_missing_frames_and_times(buffer: Buffer, transforms: Transforms) -> None:
     buffer.known['base', 'servo'] = transform(0.1, 0.0)
     buffer.until = 4
     assert transforms.lookup('base', 'ghost', 5) is LATER
@@ -345,17 +343,17 @@ def test_the_lookup_says_whether_a_frame_or_a_time_is_missing(buffer: Buffer, tr
 
 
 @pytest.mark.parametrize('timeout', [0.25, 3.0])
-def test_the_timeout_is_that_of_the_parameter(transforms: Transforms, timeout: float) -> None:
+def test_odometry_waits_as_long_as_the_timeout_parameter(transforms: Transforms, timeout: float) -> None:
     frame = MapFrame('map', transforms, timeout)
     for k in range(50):
         frame.convert(OdometryMessage(k * NANOSECONDS // 10, 'odom', 'base', Pose2(0, 0, 0)))
-    # what is as old as that waits
+    # odometry exactly as old as the timeout still waits
     assert len(frame._held) == 10 * timeout // 1 + 1
     assert frame.dropped + len(frame._held) == 50
 
 
 @pytest.mark.parametrize('begin', [0, 1_700_000_000 * NANOSECONDS])
-def test_what_waits_is_dropped_by_a_jump_and_by_no_less(transforms: Transforms, begin: int) -> None:
+def test_only_a_jump_back_of_time_drops_waiting_odometry(transforms: Transforms, begin: int) -> None:
     for back, dropped in ((frames.JUMP, 0), (frames.JUMP + 1, 2)):
         frame = MapFrame('map', transforms, 1000.0)
         for stamp in (begin + 8 * NANOSECONDS, begin + 9 * NANOSECONDS, begin + 9 * NANOSECONDS - back):
@@ -363,14 +361,12 @@ def test_what_waits_is_dropped_by_a_jump_and_by_no_less(transforms: Transforms, 
         assert frame.dropped == dropped
 
 
-def test_one_stamp_from_the_future_keeps_the_transforms_and_nobody_waiting(
-    buffer: Buffer, transforms: Transforms
-) -> None:
+def test_one_stamp_from_the_future_deletes_no_transforms(buffer: Buffer, transforms: Transforms) -> None:
     buffer.known['map', 'odom'] = transform(1.0, 0.0)
     frame = MapFrame('map', transforms, 1.0)
     taken: list[int] = []
     for stamp in (1, 2, 3600, 3, 4):
-        # TF has no transform of times to come
+        # TF has no transforms of the future
         buffer.until = 10 * NANOSECONDS
         made = frame.convert(OdometryMessage(stamp * NANOSECONDS, 'odom', 'base', Pose2(0, 0, 0)))
         taken += [each.stamp // NANOSECONDS for each in made]
@@ -380,13 +376,13 @@ def test_one_stamp_from_the_future_keeps_the_transforms_and_nobody_waiting(
 
 
 @pytest.mark.parametrize('name', ['earth', 'zone', '/zone'])
-def test_odometry_of_any_other_frame_is_converted(buffer: Buffer, transforms: Transforms, name: str) -> None:
+def test_odometry_of_another_frame_is_converted(buffer: Buffer, transforms: Transforms, name: str) -> None:
     buffer.known[name.lstrip('/'), 'odom'] = transform(1.0, 2.0)
     (made,) = MapFrame(name, transforms, 1.0).convert(OdometryMessage(5, 'odom', 'base', Pose2(0, 0, 0)))
     assert (made.frame_id, made.pose) == (name, Pose2(1.0, 2.0, 0.0))
 
 
-def test_a_frame_that_is_missing_is_asked_for_now_and_then(
+def test_missing_frame_is_looked_up_again_later(
     buffer: Buffer, transforms: Transforms, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     now = 100.0
@@ -394,17 +390,17 @@ def test_a_frame_that_is_missing_is_asked_for_now_and_then(
     for _ in range(5):
         for name in ('sonar', 'another'):
             assert transforms.lookup('base', name, 5) is LATER
-    assert buffer.asked == 2
+    assert buffer.lookups == 2
     now += frames.PATIENCE
     assert transforms.lookup('base', 'sonar', 5) is LATER
-    assert buffer.asked == 3
+    assert buffer.lookups == 3
     buffer.known['base', 'sonar'] = transform(0.1, 0.0)
     now += frames.PATIENCE
     for _ in range(3):
         assert transforms.lookup('base', 'sonar', 5) is buffer.known['base', 'sonar']
 
 
-def test_poses_of_so_many_sensors_are_remembered(
+def test_number_of_remembered_sensor_poses_is_bounded(
     buffer: Buffer, transforms: Transforms, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(frames, 'MOST_MISSING', 2)

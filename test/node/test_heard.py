@@ -1,4 +1,4 @@
-"""Sensors that stop sending are named, and those that come back are not."""
+"""Sensors that stop sending are named until they send again."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ OK, WARN = b'\x00', b'\x01'
 
 
 class Clock:
-    """Seconds that the test sets."""
+    """A clock set by the test, seconds."""
 
     def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
         self.now = 500.0
@@ -31,7 +31,7 @@ def clock(monkeypatch: pytest.MonkeyPatch) -> Clock:
 
 
 def pass_by(clock: Clock, sensors: Heard, seconds: float, **intervals: float) -> None:
-    """Let time pass in which each of these sensors sends once in its interval."""
+    """Let time pass; each of these sensors sends once in its interval."""
     begin = clock.now
     times = sorted(
         (begin + k * interval, name)
@@ -44,7 +44,7 @@ def pass_by(clock: Clock, sensors: Heard, seconds: float, **intervals: float) ->
     clock.now = begin + seconds
 
 
-def test_who_stops_while_another_goes_on_is_silent_until_he_is_back(clock: Clock) -> None:
+def test_sensor_that_stops_is_silent_until_it_sends_again(clock: Clock) -> None:
     sensors = Heard()
     pass_by(clock, sensors, 10.0, left=0.1, right=0.1)
     assert sensors.silent() == {}
@@ -54,23 +54,23 @@ def test_who_stops_while_another_goes_on_is_silent_until_he_is_back(clock: Clock
     assert sensors.silent() == {'left': pytest.approx(TIME_OUT + 4.0)}
     pass_by(clock, sensors, 0.1, left=0.1)
     assert sensors.silent() == {}
-    # the gap is not taken for its usual interval
+    # the gap is not used as the usual interval
     pass_by(clock, sensors, TIME_OUT + 0.5, right=0.1)
     assert set(sensors.silent()) == {'left'}
 
 
-def test_when_nothing_comes_at_all_nobody_is_named(clock: Clock) -> None:
+def test_no_sensor_is_silent_if_all_have_stopped(clock: Clock) -> None:
     sensors = Heard()
     pass_by(clock, sensors, 10.0, left=0.1, right=0.13, slow=2.0)
     pass_by(clock, sensors, 1000.0)
     assert sensors.silent() == {}
-    # who was silent before stays so
+    # a sensor that was silent before stays silent
     pass_by(clock, sensors, 30.0, right=0.13, slow=2.0)
     pass_by(clock, sensors, 1000.0)
     assert set(sensors.silent()) == {'left'}
 
 
-def test_a_sensor_that_sends_rarely_has_more_time(clock: Clock) -> None:
+def test_sensor_that_sends_rarely_has_a_longer_limit(clock: Clock) -> None:
     sensors = Heard()
     pass_by(clock, sensors, 100.0, fast=0.1, slow=5.0)
     assert sensors.silent() == {}
@@ -82,7 +82,7 @@ def test_a_sensor_that_sends_rarely_has_more_time(clock: Clock) -> None:
     assert sensors.silent() == {} and 'slow' not in sensors
 
 
-def test_names_that_cannot_be_shown_and_too_many_are_not_kept(clock: Clock) -> None:
+def test_unprintable_names_and_too_many_are_ignored(clock: Clock) -> None:
     sensors = Heard()
     for name in ('', 'a\nb', 'x' * 256, *(f'made up {k}' for k in range(2 * heard.MOST_FRAMES))):
         sensors.note(name)
@@ -95,8 +95,8 @@ def test_names_that_cannot_be_shown_and_too_many_are_not_kept(clock: Clock) -> N
 def test_diagnostics_name_the_silent_sensor(inside: Callable[..., Inside], monkeypatch: pytest.MonkeyPatch) -> None:
     robot = inside(**{'sensors.other.pose': [0.1, 0.0, 1.0]}).start()
     clock = Clock(monkeypatch)
-    told: list[str] = []
-    log = SimpleNamespace(info=told.append, warning=told.append, error=told.append)
+    lines: list[str] = []
+    log = SimpleNamespace(info=lines.append, warning=lines.append, error=lines.append)
     monkeypatch.setattr(robot.node, 'get_logger', lambda: log)
 
     def drive(first: int, *frames: str) -> None:
@@ -113,7 +113,7 @@ def test_diagnostics_name_the_silent_sensor(inside: Callable[..., Inside], monke
     drive(50, 'sonar')
     sensors = robot.status('sensors')
     assert sensors['level'] == WARN
-    # a frame without a pose is named elsewhere
+    # a frame without a pose is reported elsewhere
     assert sensors['message'] == 'other: no more messages'
     assert sensors['other'] == 'SILENT for 5 s; 50 readings, 0% max range'
     drive(100, 'sonar', 'other')
@@ -123,7 +123,7 @@ def test_diagnostics_name_the_silent_sensor(inside: Callable[..., Inside], monke
     robot.call(robot.node.reset)
     drive(200, 'other')
     assert robot.status('sensors')['level'] == OK
-    assert [line for line in told if 'these sensors' in line] == [
+    assert [line for line in lines if 'these sensors' in line] == [
         'these sensors have stopped sending: other',
         'these sensors send again: other',
         'these sensors have stopped sending: sonar',

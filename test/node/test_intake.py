@@ -1,4 +1,4 @@
-"""Messages on their way to the associator: what is held back, in which portions it is taken, and the account of it."""
+"""Messages on their way to the associator: waiting, portions, and counts."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from forward_grid_mapper.node.intake import AT_ONCE, QUEUE
 from forward_grid_mapper.node.losses import LASTING
 
 
-def test_what_comes_before_it_begins_is_held_back_and_then_taken_in_order() -> None:
+def test_messages_before_the_begin_wait_and_are_processed_in_order() -> None:
     robot = Taking()
     for k in range(30):
         robot.odometry(100.0 + 0.05 * k, 0.001 * k)
@@ -34,14 +34,14 @@ def test_what_comes_before_it_begins_is_held_back_and_then_taken_in_order() -> N
     assert robot.account() == (30, 30, 0, 0)
     assert robot.associator.readings.x == pytest.approx([0.1 + 0.001 * k for k in range(30)])
     assert not robot.intake.busy
-    # from here on they are taken as they come
+    # from here on, messages are processed as they come
     robot.odometry(102.0)
     robot.range(102.0)
     assert robot.account() == (31, 31, 0, 0)
     assert len(robot.published) == 31
 
 
-def test_one_turn_takes_a_portion_of_the_messages() -> None:
+def test_one_turn_processes_a_portion_of_the_messages() -> None:
     robot = Taking()
     for k in range(3 * AT_ONCE):
         robot.odometry(100.0 + 0.01 * k)
@@ -61,7 +61,7 @@ def test_one_turn_places_a_portion_of_the_readings() -> None:
         robot.range(99.5 + 0.001 * k)
     robot.odometry(100.0)
     robot.odometry(101.0)
-    # behind: what comes now waits until the others are placed
+    # behind: new messages wait until the others are placed
     robot.range(101.0)
     assert robot.intake.busy and robot.intake.waiting > 900
     before = len(robot.associator.buffer)
@@ -71,7 +71,7 @@ def test_one_turn_places_a_portion_of_the_readings() -> None:
     assert robot.account() == (1001, 1001, 0, 0)
 
 
-def test_of_too_many_that_are_held_back_the_newest_go_and_are_counted(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_too_many_waiting_messages_before_the_begin_are_rejected(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(module, 'MOST_WAITING', 5)
     robot = Taking()
     for k in range(8):
@@ -87,7 +87,7 @@ def test_of_too_many_that_are_held_back_the_newest_go_and_are_counted(monkeypatc
     assert robot.associator.odometry_received == 5
 
 
-def test_of_too_many_that_wait_behind_others_the_newest_go_as_well(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_too_many_waiting_messages_behind_others_are_rejected(monkeypatch: pytest.MonkeyPatch) -> None:
     robot = Taking(at_once=1)
     robot.intake.begin()
     robot.odometry(99.4)
@@ -103,13 +103,13 @@ def test_of_too_many_that_wait_behind_others_the_newest_go_as_well(monkeypatch: 
     assert robot.account() == (26, 24, 0, 2)
 
 
-def test_none_is_refused_where_none_were_too_many() -> None:
+def test_no_messages_give_no_rejections() -> None:
     robot = Taking()
     robot.intake.begin()
     assert robot.account() == (0, 0, 0, 0) and robot.associator.rejected == {}
 
 
-def test_a_pause_counts_for_what_comes_during_it() -> None:
+def test_readings_received_during_a_pause_are_rejected() -> None:
     robot = Taking()
     robot.odometry(99.9)
     robot.range(100.0)
@@ -121,7 +121,7 @@ def test_a_pause_counts_for_what_comes_during_it() -> None:
     robot.intake.begin()
     robot.node.turn()
     robot.odometry(100.3)
-    # also where it was held back meanwhile
+    # also if they waited meanwhile
     assert robot.account() == (3, 2, 0, 1)
     assert robot.associator.rejected['paused'] == 1
     robot.intake.paused = True
@@ -131,7 +131,7 @@ def test_a_pause_counts_for_what_comes_during_it() -> None:
     assert robot.associator.odometry_received == 4
 
 
-def test_forgetting_begins_the_account_anew() -> None:
+def test_reset_of_the_intake_clears_all_counts() -> None:
     robot = Taking()
     robot.range(100.0, number=1)
     robot.range(100.1, number=50)
@@ -145,7 +145,7 @@ def test_forgetting_begins_the_account_anew() -> None:
     assert robot.intake.loss_note() == []
 
 
-def test_as_many_lost_of_one_kind_as_of_the_other() -> None:
+def test_lost_ranges_and_odometry_are_counted_separately() -> None:
     robot = Taking()
     for number in (1, 3):
         robot.range(100.0 + number, number=number)
@@ -154,7 +154,7 @@ def test_as_many_lost_of_one_kind_as_of_the_other() -> None:
     assert '1 Range and 1 odometry' in robot.intake.loss_note()[0]
 
 
-def test_topics_are_subscribed_to_once_each_and_left() -> None:
+def test_topics_are_subscribed_once_and_unsubscribed() -> None:
     robot = Taking(range_topics=('a', 'b', 'a'), odom_topic='wheels', odom_reliability='reliable')
     intake, node = robot.intake, robot.node
     assert not intake.listening
@@ -171,7 +171,7 @@ def test_topics_are_subscribed_to_once_each_and_left() -> None:
     assert not intake.listening and node.subscribed == {} and intake.subscriptions == {}
     assert 'sonar' not in intake.heard
     intake.subscribe()
-    # what was published meanwhile was not lost
+    # messages published meanwhile do not count as lost
     robot.range(101.0, number=500)
     robot.range(101.0, number=500, topic=1)
     assert intake.lost == 0
@@ -199,7 +199,7 @@ def test_topics_with_the_same_readings_are_named_until_it_forgets() -> None:
 @pytest.mark.parametrize(
     ('reliability', 'remedy'), [('reliable', 'or the load of the machine'), ('best_effort', 'network')]
 )
-def test_losses_are_warned_of_while_they_are_fresh_and_in_the_log_now_and_then(
+def test_recent_losses_give_a_warning_and_rare_log_lines(
     monkeypatch: pytest.MonkeyPatch, reliability: str, remedy: str
 ) -> None:
     now = 1000.0
@@ -210,11 +210,11 @@ def test_losses_are_warned_of_while_they_are_fresh_and_in_the_log_now_and_then(
     robot.range(100.1, number=4)
     robot.odometry(100.0, number=1)
     robot.odometry(100.1, number=7)
-    (told,) = robot.intake.faults()
-    assert '2 Range and 5 odometry messages so far were lost' in told and remedy in told
-    assert robot.node.warned == [told]
+    (fault,) = robot.intake.faults()
+    assert '2 Range and 5 odometry messages so far were lost' in fault and remedy in fault
+    assert robot.node.warned == [fault]
     assert '2 Range and 5 odometry messages were lost' in robot.intake.loss_note()[0]
-    # more of them soon are in the diagnostics, and in the log when it was silent for a while
+    # further losses are in the diagnostics, and in the log only after some time
     now += LASTING / 2
     robot.range(100.2, number=6)
     assert '3 Range' in robot.intake.faults()[0] and len(robot.node.warned) == 1
@@ -225,7 +225,7 @@ def test_losses_are_warned_of_while_they_are_fresh_and_in_the_log_now_and_then(
     assert len(robot.node.warned) == 2
 
 
-def test_a_clock_that_jumps_back_is_told_of() -> None:
+def test_jump_back_of_time_gives_a_warning() -> None:
     robot = Taking()
     robot.intake.begin()
     robot.odometry(100.0)
@@ -240,8 +240,8 @@ def test_a_clock_that_jumps_back_is_told_of() -> None:
     assert robot.account() == (2, 1, 0, 1)
 
 
-def test_odometry_that_waited_for_a_transform_comes_in_order(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Before whatever else is held back."""
+def test_odometry_that_waited_for_a_transform_is_in_order(monkeypatch: pytest.MonkeyPatch) -> None:
+    """It comes before other waiting messages."""
     robot = Taking()
     robot.intake.begin()
     waited: list[Any] = []
@@ -266,7 +266,7 @@ def test_odometry_that_waited_for_a_transform_comes_in_order(monkeypatch: pytest
 
 
 class Localiser:
-    """TF of a localiser that begins late; as tf2's buffer does, it forgets all when it is cleared."""
+    """TF of a localiser that starts late; like the buffer of tf2, it deletes all transforms on `clear`."""
 
     def __init__(self) -> None:
         self.begin, self.end, self.cleared = 1 << 62, 0, 0
@@ -286,14 +286,14 @@ class Localiser:
 
 
 class ExtrapolationException(Exception):
-    """What tf2 raises outside of the times that it has."""
+    """Raised by tf2 for times without transform."""
 
 
-def test_odometry_that_waited_for_the_map_frame_is_no_clock_that_jumped() -> None:
+def test_odometry_that_waited_for_the_map_frame_is_no_jump() -> None:
     tf = Localiser()
     robot = Taking(map_frame=MapFrame('map', Transforms(tf, ExtrapolationException), 2.0))
     robot.intake.begin()
-    # the localiser begins after 1.5 s, when hundreds of messages wait, and its newest transform is 1 s ahead
+    # the localiser starts after 1.5 s, while hundreds of messages wait, and its newest transform is 1 s ahead
     for k in range(600):
         robot.odometry(100.0 + 0.01 * k, 0.01 * k)
         if k % 10 == 5:
@@ -303,14 +303,14 @@ def test_odometry_that_waited_for_the_map_frame_is_no_clock_that_jumped() -> Non
         robot.node.turn()
     assert tf.cleared == 0
     assert robot.associator.map_frame == 'map'
-    # those of the first 2.5 s have no transform, or none before them
+    # odometry of the first 2.5 s has no transform, or none before it
     assert robot.associator.rejected.total() <= 26
     assert len(robot.associator.buffer) >= 34
     assert robot.associator.readings.x.min() > 5.0
 
 
-def test_a_subscription_that_fails_leaves_none(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Or else the readings of the others came twice when it is tried again."""
+def test_failed_subscription_removes_all_subscriptions(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Otherwise the readings of the others would come twice after a retry."""
     robot = Taking()
     create, failing = robot.node.create_subscription, ['/odom', 'odom']
 

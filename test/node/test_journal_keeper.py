@@ -1,4 +1,4 @@
-"""What links readings to the journal: what is new goes to disk, and what an earlier run left comes back."""
+"""The link between readings and the journal: new readings are written, and those of an earlier run are restored."""
 
 from __future__ import annotations
 
@@ -37,8 +37,8 @@ class Node(PlainNode):
         self.timers.append((period, callback, clock))
 
 
-class Kept:
-    """A keeper of a journal with its associator."""
+class KeptJournal:
+    """A keeper of a journal, with its associator."""
 
     def __init__(self, folder: Path | str, **values: Any) -> None:
         parameters = Parameters.from_flat(values)
@@ -47,13 +47,13 @@ class Kept:
         self.keeper = JournalKeeper(self.node, str(folder), self.associator)  # type: ignore[arg-type]
         self.keeper.open()
 
-    def start(self) -> Kept:
+    def start(self) -> KeptJournal:
         self.keeper.restore()
         self.keeper.begin('the clock')
         return self
 
     def drive(self, first: int, count: int) -> None:
-        """Accept readings, whose stamp is their number."""
+        """Accept readings; their stamps are their numbers."""
         self.associator.map_frame, self.associator.base_frame = 'odom', 'base_link'
         self.associator.restore(made(np.arange(first, first + count)))
 
@@ -84,8 +84,8 @@ def stored(path: Path) -> tuple[list[int], Contents]:
     return [int(stamp) for readings in read(path, contents) for stamp in readings.stamp], contents
 
 
-def test_without_a_folder_there_is_nothing_to_do() -> None:
-    kept = Kept('').start()
+def test_without_a_folder_no_journal_is_kept() -> None:
+    kept = KeptJournal('').start()
     kept.drive(0, 3)
     kept.keeper.take()
     assert kept.node.timers == [] and kept.associator.buffer.before_thinning == []
@@ -93,8 +93,8 @@ def test_without_a_folder_there_is_nothing_to_do() -> None:
     kept.keeper.close()
 
 
-def test_what_is_new_goes_to_disk_and_comes_back(tmp_path: Path) -> None:
-    kept = Kept(tmp_path, sigma=0.07).start()
+def test_new_readings_are_written_and_restored(tmp_path: Path) -> None:
+    kept = KeptJournal(tmp_path, sigma=0.07).start()
     ((period, take, clock),) = kept.node.timers
     assert (period, clock) == (PERIOD, 'the clock')
     for first in (0, 5):
@@ -111,7 +111,7 @@ def test_what_is_new_goes_to_disk_and_comes_back(tmp_path: Path) -> None:
     assert contents.path == [(0.0, 1.0), (5.0, 1.0)]
     assert contents.parameters['sigma'] == 0.07
 
-    again = Kept(tmp_path).start()
+    again = KeptJournal(tmp_path).start()
     assert len(again.associator.buffer) == 12
     assert (again.associator.map_frame, again.associator.base_frame) == ('odom', 'base_link')
     assert list(again.associator.path) == [(0.0, 1.0), (5.0, 1.0)]
@@ -124,26 +124,26 @@ def test_what_is_new_goes_to_disk_and_comes_back(tmp_path: Path) -> None:
     assert contents.path == [(0.0, 1.0), (5.0, 1.0)]
 
 
-def test_a_new_journal_names_no_frame(tmp_path: Path) -> None:
-    kept = Kept(tmp_path).start()
+def test_new_journal_has_no_frame(tmp_path: Path) -> None:
+    kept = KeptJournal(tmp_path).start()
     assert '0 readings of an earlier run are restored, in frame (none yet)' in kept.node.warned[0]
     assert len(kept.node.warned) == 1
     kept.keeper.close()
 
 
-def test_readings_that_do_not_fit_on_the_map_any_more_are_told_of(tmp_path: Path) -> None:
-    kept = Kept(tmp_path).start()
+def test_restored_readings_outside_the_map_give_a_warning(tmp_path: Path) -> None:
+    kept = KeptJournal(tmp_path).start()
     kept.drive(0, 5)
     kept.drive(100_000, 5)
     kept.keeper.close()
-    again = Kept(tmp_path, max_cells=10_000).start()
+    again = KeptJournal(tmp_path, max_cells=10_000).start()
     assert len(again.associator.buffer) < 10
     assert 'of its readings do not fit into the map (max_cells, resolution)' in again.node.warned[1]
     again.keeper.close()
 
 
-def test_what_would_be_thinned_is_taken_before(tmp_path: Path) -> None:
-    kept = Kept(tmp_path).start()
+def test_readings_are_written_before_thinning(tmp_path: Path) -> None:
+    kept = KeptJournal(tmp_path).start()
     kept.drive(0, 4)
     for look in kept.associator.buffer.before_thinning:
         look()
@@ -152,8 +152,8 @@ def test_what_would_be_thinned_is_taken_before(tmp_path: Path) -> None:
     kept.keeper.close()
 
 
-def test_a_reset_begins_a_new_file_and_says_where_the_old_one_is(tmp_path: Path) -> None:
-    kept = Kept(tmp_path).start()
+def test_reset_begins_a_new_file_and_names_the_old_one(tmp_path: Path) -> None:
+    kept = KeptJournal(tmp_path).start()
     assert kept.keeper.reset() == '', 'there is nothing to keep'
     kept.drive(0, 4)
     kept.associator.extend_path((1.0, 2.0))
@@ -169,7 +169,7 @@ def test_a_reset_begins_a_new_file_and_says_where_the_old_one_is(tmp_path: Path)
     assert stored(tmp_path / 'drive_0001.journal')[0] == [0, 1, 2, 3]
     found, contents = stored(tmp_path / 'drive_0002.journal')
     assert found == [20, 21] and contents.path == [(1.0, 2.0)], 'the robot has not moved'
-    again = Kept(tmp_path).start()
+    again = KeptJournal(tmp_path).start()
     assert again.values()['readings restored'] == '2'
     again.associator.clear()
     again.keeper.reset()
@@ -177,8 +177,8 @@ def test_a_reset_begins_a_new_file_and_says_where_the_old_one_is(tmp_path: Path)
     again.keeper.close()
 
 
-def test_a_journal_that_vanished_is_written_anew_from_memory(tmp_path: Path) -> None:
-    kept = Kept(tmp_path).start()
+def test_deleted_journal_is_written_again_from_memory(tmp_path: Path) -> None:
+    kept = KeptJournal(tmp_path).start()
     kept.drive(0, 4)
     kept.associator.extend_path((1.0, 1.0))
     kept.keeper.take()
@@ -197,7 +197,7 @@ def test_a_journal_that_vanished_is_written_anew_from_memory(tmp_path: Path) -> 
     kept.settle()
     status = kept.status()
     assert status.level == WARN and status.message == journal.notice != ''
-    # it was dealt with: after a while only a key says so
+    # the fault is repaired: after some time only a key mentions it
     journal.noticed = time.monotonic() - NOTICE - 0.1
     assert kept.status().level == OK and kept.values()['last fault of a file'] == journal.notice
     journal.noticed = time.monotonic() - NOTICE + 30.0
@@ -207,8 +207,8 @@ def test_a_journal_that_vanished_is_written_anew_from_memory(tmp_path: Path) -> 
     assert found == list(range(7)) and contents.path == [(1.0, 1.0)] and contents.map_frame == 'odom'
 
 
-def test_other_parameters_are_stated_in_the_file(tmp_path: Path) -> None:
-    kept = Kept(tmp_path).start()
+def test_changed_parameters_are_written_to_the_file(tmp_path: Path) -> None:
+    kept = KeptJournal(tmp_path).start()
     kept.drive(0, 1)
     kept.keeper.take()
     kept.node.parameters = Parameters.from_flat({'sigma': 0.09})
@@ -217,8 +217,8 @@ def test_other_parameters_are_stated_in_the_file(tmp_path: Path) -> None:
     assert stored(tmp_path / 'drive_0001.journal')[1].parameters['sigma'] == 0.09
 
 
-def test_the_status_says_what_waits_and_what_is_lost(tmp_path: Path) -> None:
-    kept = Kept(tmp_path).start()
+def test_status_has_waiting_and_lost_readings(tmp_path: Path) -> None:
+    kept = KeptJournal(tmp_path).start()
     status = kept.status()
     assert (status.level, status.message, status.name) == (OK, 'writing', 'mapper: journal')
     values = kept.values()
@@ -230,7 +230,7 @@ def test_the_status_says_what_waits_and_what_is_lost(tmp_path: Path) -> None:
     journal.lost = 7
     assert kept.status().level == WARN and kept.values()['readings lost'] == '7'
     assert kept.status().message == '7 readings were received while nothing could be written'
-    # what is so now goes before what was
+    # present faults come before past ones
     journal.trouble = 'the disk is broken'
     assert kept.status().message == 'the disk is broken'
     journal.trouble, journal.lost = '', 0
@@ -245,11 +245,11 @@ def failing(cause: BaseException | None) -> Callable[..., Any]:
 
 
 @pytest.mark.parametrize('number', [errno.ENOSPC, errno.EDQUOT])
-def test_a_full_disk_at_the_start_does_not_keep_the_node_from_mapping(
+def test_node_maps_without_a_journal_if_the_disk_is_full(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, number: int
 ) -> None:
     monkeypatch.setattr(journal_keeper, 'Journal', failing(OSError(number, 'full')))
-    kept = Kept(tmp_path).start()
+    kept = KeptJournal(tmp_path).start()
     kept.drive(0, 1)
     kept.keeper.take()
     assert kept.node.warned == ['no journal is kept: cannot be opened'] and kept.node.timers == []
@@ -260,9 +260,9 @@ def test_a_full_disk_at_the_start_does_not_keep_the_node_from_mapping(
 
 
 @pytest.mark.parametrize('cause', [OSError(errno.EACCES, 'denied'), ValueError('odd'), None])
-def test_another_reason_ends_the_start(
+def test_other_errors_of_the_journal_end_the_start(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, cause: BaseException | None
 ) -> None:
     monkeypatch.setattr(journal_keeper, 'Journal', failing(cause))
     with pytest.raises(OutputError, match='cannot be opened'):
-        Kept(tmp_path)
+        KeptJournal(tmp_path)

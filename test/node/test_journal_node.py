@@ -1,4 +1,4 @@
-"""The node with a journal: killed, started again, and mapped offline from what it kept."""
+"""The node with a journal: killed, restarted, and mapped offline from the journal."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ OPTIONS = (
 
 
 def drive(first: int, count: int) -> list[Any]:
-    """Readings of a robot in a round room, an odometry message with each."""
+    """Readings of a robot in a round room, each with an odometry message."""
     out: list[Any] = []
     for k in range(first, first + count):
         stamp = k * NANOSECONDS // 20
@@ -45,7 +45,7 @@ def until_accepted(robot: Robot, count: int) -> None:
 
 
 @pytest.mark.slow
-def test_a_node_that_is_killed_goes_on_where_it_was(
+def test_killed_node_continues_after_a_restart(
     start: Any, domain: int, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     folder = tmp_path / 'the journal'
@@ -100,13 +100,13 @@ def test_a_node_that_is_killed_goes_on_where_it_was(
     assert node.stop() == 0
     node = start(*options)
     assert '50 readings of an earlier run are restored' in node.output
-    # a node stopped in order leaves no log, and one that runs has one
+    # a node that ended normally leaves no log, a running one has a log
     files = {path.name for path in folder.iterdir()}
     assert files - {'drive_0002.journal-wal'} == {'drive_0001.journal', 'drive_0002.journal', 'lock'}
     first = folder / 'drive_0001.journal'
     assert process_bag([str(first), '-o', str(tmp_path / 'old'), '-q']) == 0
     first.write_bytes(first.read_bytes()[: first.stat().st_size * 2 // 3])
-    # which pages are gone depends on when the node wrote: either some readings are left, or it says why none is
+    # the missing pages depend on when the node wrote: either some readings are left, or the error is reported
     capsys.readouterr()
     left = process_bag([str(first), '-o', str(tmp_path / 'torn'), '-q']) == 0
     assert left or 'cannot be read to its end' in capsys.readouterr().err
@@ -126,7 +126,7 @@ def test_node_and_offline_keep_the_same_readings(start: Any, robot: Robot, tmp_p
     assert not any('arrived after EM' in text for text in warnings)
     out = tmp_path / 'offline'
     assert process_bag([str(folder), '-o', str(out), '-q', '--set', 'max_readings=300']) == 0
-    # a journal does not say where the sensors sit, so poses cannot be compared with the readings; these make no room
+    # a journal has no poses of the sensors, so they cannot be compared with the readings; these readings fit no room
     warnings = [text for text in warnings if 'with this corrected' not in text]
     assert warnings == json.loads((out / 'report.json').read_text())['warnings']
     ours, offline = read_npz(saved / 'maps.npz'), read_npz(out / 'maps.npz')
@@ -135,7 +135,7 @@ def test_node_and_offline_keep_the_same_readings(start: Any, robot: Robot, tmp_p
         assert np.array_equal(getattr(ours, name), getattr(offline, name), equal_nan=True)
 
 
-def test_a_journal_that_cannot_be(start: Any, tmp_path: Path) -> None:
+def test_journal_path_below_a_file_is_rejected(start: Any, tmp_path: Path) -> None:
     (tmp_path / 'file').write_text('')
     node = start('-p', f'journal:={tmp_path}/file/journal', ready=False)
     assert node.process.wait(60) == 1
@@ -147,16 +147,14 @@ def journal_status(robot: Robot) -> dict[str, Any]:
     return dict(robot.diagnostics.get('journal', {}))
 
 
-def test_a_journal_that_is_deleted_or_hostile_is_begun_anew(
-    start: Any, domain: int, robot: Robot, tmp_path: Path
-) -> None:
+def test_deleted_or_hostile_journal_is_replaced(start: Any, domain: int, robot: Robot, tmp_path: Path) -> None:
     folder = tmp_path / 'journal'
     options = (*OPTIONS, '-p', f'journal:={folder}')
     node = start(*options)
     robot.meet()
     robot.play(drive(0, 300))
     until_accepted(robot, 300)
-    # also while nothing comes
+    # also without new messages
     (folder / 'drive_0001.journal').unlink()
     robot.until(lambda: journal_status(robot).get('file') == 'drive_0002.journal', what='a new file')
     assert journal_status(robot)['level'] != b'\x00'
@@ -175,7 +173,7 @@ def test_a_journal_that_is_deleted_or_hostile_is_begun_anew(
     node = start(*options)
     assert 'the journal continues in drive_0003.journal' in node.output
     assert '0 readings of an earlier run are restored' in node.output
-    # another one, since the first still counts the node that was killed among its subscribers
+    # a new client, since the first one still counts the killed node among its subscribers
     other = Robot(domain)
     try:
         other.meet()

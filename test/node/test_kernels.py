@@ -1,4 +1,4 @@
-"""Compilation in the background: in order, waited for by who needs it, and whatever fails, everybody goes on."""
+"""Compilation in the background: the order, waiting for it, and errors."""
 
 from __future__ import annotations
 
@@ -17,11 +17,11 @@ from forward_grid_mapper.node.kernels import Kernels
 
 
 class Compiling:
-    """Steps that wait until the test lets them go on."""
+    """Steps that wait until the test lets them continue."""
 
     def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
         self.done: list[str] = []
-        self.said: list[str] = []
+        self.lines: list[str] = []
         self.ready: list[str] = []
         self.failing = ''
         self.go_on = {name: threading.Event() for name in warm_up.STEPS}
@@ -37,7 +37,7 @@ class Compiling:
         return compile_it
 
     def begin(self, online: bool = True, refine: bool = True) -> Kernels:
-        kernels = Kernels(self.said.append, self.said.append, online, refine)
+        kernels = Kernels(self.lines.append, self.lines.append, online, refine)
         kernels.begin(lambda: self.ready.append(kernels.stage))
         return kernels
 
@@ -53,7 +53,7 @@ def compiling(monkeypatch: pytest.MonkeyPatch) -> Iterator[Compiling]:
 
 
 def ended(kernels: Kernels) -> None:
-    """Wait until nothing is left to compile, and the thread has gone."""
+    """Wait until compilation is done and the thread has ended."""
     for thread in threading.enumerate():
         if thread.name == 'kernels':
             thread.join(PATIENCE)
@@ -61,7 +61,7 @@ def ended(kernels: Kernels) -> None:
     assert 'kernels' not in {thread.name for thread in threading.enumerate()}
 
 
-def test_the_live_map_has_its_kernels_first(compiling: Compiling) -> None:
+def test_kernels_of_the_live_map_are_compiled_first(compiling: Compiling) -> None:
     kernels = compiling.begin()
     assert not kernels.has('live map') and kernels.stage == 'live map' and not gc.isenabled()
     compiling.go_on['live map'].set()
@@ -78,7 +78,7 @@ def test_the_live_map_has_its_kernels_first(compiling: Compiling) -> None:
     assert (kernels.stage, kernels in Kernels.at_work, gc.isenabled()) == ('', False, True)
 
 
-def test_what_is_not_wanted_is_left_out_and_not_waited_for(compiling: Compiling) -> None:
+def test_unneeded_steps_are_skipped_and_not_waited_for(compiling: Compiling) -> None:
     for event in compiling.go_on.values():
         event.set()
     kernels = compiling.begin(online=False, refine=False)
@@ -89,7 +89,7 @@ def test_what_is_not_wanted_is_left_out_and_not_waited_for(compiling: Compiling)
 
 
 @pytest.mark.parametrize('failing', ['live map', 'EM'])
-def test_a_step_that_fails_keeps_nobody_waiting(compiling: Compiling, failing: str) -> None:
+def test_failing_step_blocks_no_caller(compiling: Compiling, failing: str) -> None:
     compiling.failing = failing
     for event in compiling.go_on.values():
         event.set()
@@ -98,11 +98,11 @@ def test_a_step_that_fails_keeps_nobody_waiting(compiling: Compiling, failing: s
         kernels.wait(name)
     ended(kernels)
     assert len(compiling.ready) == 1
-    assert any('there is not enough memory' in text for text in compiling.said)
+    assert any('there is not enough memory' in text for text in compiling.lines)
     assert kernels.worker.trouble and kernels not in Kernels.at_work and gc.isenabled()
 
 
-def test_pictures_that_cannot_be_drawn_do_not_leave_the_collector_off(
+def test_garbage_collector_is_enabled_after_an_error_of_drawing(
     compiling: Compiling, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def fail(*arguments: Any) -> None:
@@ -116,9 +116,7 @@ def test_pictures_that_cannot_be_drawn_do_not_leave_the_collector_off(
     assert gc.isenabled() and kernels not in Kernels.at_work and kernels.worker.trouble == ''
 
 
-def test_without_a_thread_everybody_goes_on_and_the_collector_too(
-    compiling: Compiling, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_failed_start_of_the_thread_blocks_no_caller(compiling: Compiling, monkeypatch: pytest.MonkeyPatch) -> None:
     def fail(thread: threading.Thread) -> None:
         raise RuntimeError("can't start new thread")
 

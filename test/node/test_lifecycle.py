@@ -1,4 +1,4 @@
-"""The lifecycle of the node: a manager starts and ends it as Nav2's does, and without one it starts by itself."""
+"""The lifecycle of the node: a manager starts and ends it as in Nav2; without one, it starts by itself."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ sys.exit(main.main(sys.argv[1:]))
 
 
 class Manager:
-    """Calls what Nav2's lifecycle manager calls, and waits as long as that does by default."""
+    """Calls the services that the lifecycle manager of Nav2 calls, with its default time-outs."""
 
     SECONDS = 5.0
 
@@ -82,7 +82,7 @@ def manager(robot: Robot) -> Manager:
 
 
 def published(robot: Robot) -> set[str]:
-    # services answer before the graph is known
+    # services respond before the graph is known
     robot.until(lambda: ('forward_grid_mapper', '/') in robot.node.get_node_names_and_namespaces())
     return {name for name, _ in robot.node.get_publisher_names_and_types_by_node('forward_grid_mapper', '/')}
 
@@ -92,12 +92,12 @@ def received(robot: Robot) -> int:
 
 
 def later(robot: Robot) -> None:
-    """Wait for diagnostics that were made after this was called."""
+    """Wait for diagnostics published after this call."""
     robot.diagnostics.clear()
     robot.until(lambda: 'readings' in robot.diagnostics)
 
 
-def test_a_transition_that_the_state_does_not_admit_is_answered(start: Any, robot: Robot, manager: Manager) -> None:
+def test_invalid_transition_is_rejected_with_a_response(start: Any, robot: Robot, manager: Manager) -> None:
     node = start(*WAITING, ready=False)
     node.wait_for('unconfigured:')
     for transition in (Transition.TRANSITION_ACTIVATE, 99):
@@ -106,13 +106,13 @@ def test_a_transition_that_the_state_does_not_admit_is_answered(start: Any, robo
     manager.start_up()
 
 
-def test_a_manager_starts_pauses_and_ends_it(start: Any, robot: Robot, manager: Manager) -> None:
+def test_manager_starts_pauses_and_ends_the_node(start: Any, robot: Robot, manager: Manager) -> None:
     node = start(*WAITING, ready=False)
     node.wait_for('unconfigured:')
     assert manager.state() == State.PRIMARY_STATE_UNCONFIGURED
     assert not any(name.endswith('_map') for name in published(robot))
     assert manager.change(Transition.TRANSITION_CONFIGURE)
-    # maps and services are there, and no message is taken
+    # maps and services exist, and messages are not received
     robot.until(lambda: {f'/forward_grid_mapper/{name}' for name in MAPS} <= published(robot))
     robot.until(lambda: robot.diagnostics.get('readings', {}).get('message') == 'inactive: nothing is received')
     assert robot.range_out.get_subscription_count() == 0
@@ -125,7 +125,7 @@ def test_a_manager_starts_pauses_and_ends_it(start: Any, robot: Robot, manager: 
     assert robot.call('run_em').success
     wide = robot.get_map('ml_map').info.width
     assert wide > 1
-    # what is sent while it is inactive is neither received nor lost, and the maps stay
+    # messages sent while the node is inactive are neither received nor lost, and the maps stay
     assert manager.change(Transition.TRANSITION_DEACTIVATE)
     robot.until(lambda: robot.range_out.get_subscription_count() == 0)
     for message in circle(300, 300):
@@ -137,7 +137,7 @@ def test_a_manager_starts_pauses_and_ends_it(start: Any, robot: Robot, manager: 
     assert received(robot) == robot.sent
     assert readings['readings lost in the middleware (estimated)'] == '0'
     assert robot.get_map('ml_map').info.width == wide
-    # and everything is gone after a cleanup, and comes again, empty
+    # clean up removes everything, and configure makes it again, empty
     assert manager.change(Transition.TRANSITION_DEACTIVATE)
     assert manager.change(Transition.TRANSITION_CLEANUP)
     assert manager.state() == State.PRIMARY_STATE_UNCONFIGURED
@@ -159,19 +159,19 @@ def test_a_manager_starts_pauses_and_ends_it(start: Any, robot: Robot, manager: 
     assert 'Traceback' not in node.output
 
 
-def test_by_itself_it_is_active(start: Any, robot: Robot, manager: Manager) -> None:
+def test_node_activates_itself(start: Any, robot: Robot, manager: Manager) -> None:
     node = start(*OPTIONS)
     assert manager.state() == State.PRIMARY_STATE_ACTIVE
     robot.meet()
     robot.play(circle(0, 200))
-    # a shutdown in the midst of work
+    # shutdown during work
     robot.ask('run_em')
     assert manager.change(Transition.TRANSITION_ACTIVE_SHUTDOWN)
     assert manager.state() == State.PRIMARY_STATE_FINALIZED
     assert node.stop() == 0
 
 
-def test_what_cannot_be_configured_is_refused_in_words(start: Any, robot: Robot, manager: Manager) -> None:
+def test_failed_configuration_is_reported(start: Any, robot: Robot, manager: Manager) -> None:
     node = start(*WAITING, '-p', 'odom_topic:=sonar', ready=False)
     node.wait_for('unconfigured:')
     for _ in range(2):
@@ -183,9 +183,7 @@ def test_what_cannot_be_configured_is_refused_in_words(start: Any, robot: Robot,
     assert node.stop() == 0
 
 
-def test_the_journal_is_given_back_at_every_configuration(
-    start: Any, robot: Robot, manager: Manager, tmp_path: Path
-) -> None:
+def test_each_configuration_restores_the_journal(start: Any, robot: Robot, manager: Manager, tmp_path: Path) -> None:
     node = start(*WAITING, '-p', f'journal:={tmp_path}/journal', ready=False)
     node.wait_for('unconfigured:')
     manager.start_up()
@@ -203,7 +201,7 @@ def test_the_journal_is_given_back_at_every_configuration(
 
 
 @pytest.mark.parametrize('autostart', ['true', 'false'])
-def test_without_lifecycle_msgs_it_starts_by_itself_or_not_at_all(domain: int, tmp_path: Path, autostart: str) -> None:
+def test_node_without_lifecycle_msgs_starts_itself_or_ends(domain: int, tmp_path: Path, autostart: str) -> None:
     log = tmp_path / 'node.log'
     command = [sys.executable, '-c', UNMANAGED, '--ros-args', *OPTIONS, '-p', f'autostart:={autostart}']
     with log.open('w') as file:
@@ -221,7 +219,7 @@ def test_without_lifecycle_msgs_it_starts_by_itself_or_not_at_all(domain: int, t
         process.kill()
 
 
-def test_the_page_gives_parameters_of_a_lifecycle_manager() -> None:
+def test_documented_parameters_of_the_lifecycle_manager() -> None:
     """As `nav2_lifecycle_manager` declares them: autostart, node_names, bond_timeout and others."""
     blocks = re.findall(r'```yaml\n(.*?)```', PAGE.read_text(encoding='utf-8'), re.DOTALL)
     (given,) = (made for made in map(yaml.safe_load, blocks) if 'lifecycle_manager_mapper' in made)
@@ -233,7 +231,7 @@ def test_the_page_gives_parameters_of_a_lifecycle_manager() -> None:
         'bond_timeout': 0.0,
     }
     assert isinstance(values['bond_timeout'], float)
-    # both cannot start it
+    # only one of the two may start the node
     assert 'autostart:=false' in PAGE.read_text(encoding='utf-8')
     assert find('autostart').default is True
 
@@ -246,7 +244,7 @@ def sockets() -> int:
     return found
 
 
-def test_a_clean_up_leaves_neither_readings_nor_threads(inside: Callable[..., Inside]) -> None:
+def test_clean_up_leaves_no_readings_or_threads(inside: Callable[..., Inside]) -> None:
     others = {*threading.enumerate()}
     robot = inside()
     node = robot.node
@@ -255,7 +253,7 @@ def test_a_clean_up_leaves_neither_readings_nor_threads(inside: Callable[..., In
         robot.until(lambda: not Kernels.at_work)
         parts = [weakref.ref(part) for part in (node.associator, node.associator.buffer, node.live, node.em, node.maps)]
         assert node.trigger_deactivate() == node.trigger_cleanup() == TransitionCallbackReturn.SUCCESS
-        # the executor looks anew what there is
+        # let the executor update its list of waitables
         robot.spin(0.1)
         gc.collect()
         assert [part() for part in parts] == [None] * len(parts)
@@ -264,7 +262,7 @@ def test_a_clean_up_leaves_neither_readings_nor_threads(inside: Callable[..., In
 
 @pytest.fixture
 def peer(inside: Callable[..., Inside]) -> Iterator[Callable[[Inside], Any]]:
-    """Make another node beside one, whose executor the test turns."""
+    """Make another node in the context of a node."""
     made = []
 
     def beside(robot: Inside) -> Any:
@@ -277,7 +275,7 @@ def peer(inside: Callable[..., Inside]) -> Iterator[Callable[[Inside], Any]]:
         node.destroy_node()
 
 
-def test_simulated_time_that_was_set_while_it_ran_goes_on_after_a_clean_up(
+def test_simulated_time_set_at_run_time_stays_after_a_clean_up(
     inside: Callable[..., Inside], peer: Callable[[Inside], Any]
 ) -> None:
     robot = inside()
@@ -296,7 +294,7 @@ def test_simulated_time_that_was_set_while_it_ran_goes_on_after_a_clean_up(
     robot.until(lambda: comes(200), 20.0)
 
 
-def test_what_configure_reads_is_set_between_cleanup_and_configure(inside: Callable[..., Inside]) -> None:
+def test_read_only_parameters_can_be_set_between_cleanup_and_configure(inside: Callable[..., Inside]) -> None:
     robot = inside()
     node = robot.node
     node.start()
@@ -317,9 +315,7 @@ def test_what_configure_reads_is_set_between_cleanup_and_configure(inside: Calla
     assert node.live.grid.resolution == 0.2
 
 
-def test_who_waits_for_an_answer_has_one_when_the_node_is_cleaned_up(
-    inside: Callable[..., Inside], peer: Callable[[Inside], Any]
-) -> None:
+def test_clean_up_responds_to_waiting_calls(inside: Callable[..., Inside], peer: Callable[[Inside], Any]) -> None:
     robot = inside().start()
     node = robot.node
 
@@ -329,19 +325,19 @@ def test_who_waits_for_an_answer_has_one_when_the_node_is_cleaned_up(
 
     node.em.worker._prepare = hold
     other = peer(robot)
-    asked = []
+    calls = []
     for name in ('run_em', 'save_maps'):
         client = other.create_client(Trigger, f'/forward_grid_mapper/{name}')
         robot.until(client.service_is_ready, 20.0)
-        asked.append(client.call_async(Trigger.Request()))
+        calls.append(client.call_async(Trigger.Request()))
     robot.until(lambda: node.em.current and len(node.em.current.waiting) == 3, 20.0)
     assert node.trigger_deactivate() == node.trigger_cleanup() == TransitionCallbackReturn.SUCCESS
-    robot.until(lambda: all(call.done() for call in asked), 20.0)
-    for call in asked:
+    robot.until(lambda: all(call.done() for call in calls), 20.0)
+    for call in calls:
         assert (call.result().success, call.result().message) == (False, 'the node is being cleaned up')
 
 
-def test_an_activation_that_fails_has_nothing_taken_twice(
+def test_failed_activation_leaves_no_double_subscriptions(
     inside: Callable[..., Inside], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     robot = inside()
@@ -365,7 +361,7 @@ def test_an_activation_that_fails_has_nothing_taken_twice(
     ]
 
 
-def test_activations_one_after_the_other_leave_nothing(inside: Callable[..., Inside]) -> None:
+def test_repeated_activations_leave_no_extra_entities(inside: Callable[..., Inside]) -> None:
     node = inside().start().node
     before = len(node._created)
     for _ in range(3):
@@ -374,17 +370,17 @@ def test_activations_one_after_the_other_leave_nothing(inside: Callable[..., Ins
     assert len([each for each in node.subscriptions if each.msg_type in (Range, Odometry)]) == 2
 
 
-def test_a_journal_that_is_still_read_does_not_reach_what_is_configured_next(inside: Callable[..., Inside]) -> None:
+def test_readings_restored_after_a_clean_up_do_not_reach_new_parts(inside: Callable[..., Inside]) -> None:
     node = inside(max_readings=10).node
     assert node.trigger_configure() == TransitionCallbackReturn.SUCCESS
     before = node.associator
     assert node.trigger_cleanup() == TransitionCallbackReturn.SUCCESS
-    # what is thinned is handed to the maps before
+    # before thinning, readings are given to the maps
     assert before.restore(some_readings(30)) == 0
     assert before.buffer.held < len(before.buffer) == 30
 
 
-def test_a_configuration_that_was_refused_does_not_keep_the_journal(
+def test_failed_configuration_releases_the_journal(
     inside: Callable[..., Inside], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     def refused(*arguments: Any) -> Any:
@@ -397,7 +393,7 @@ def test_a_configuration_that_was_refused_does_not_keep_the_journal(
     assert node.trigger_configure() == TransitionCallbackReturn.SUCCESS
 
 
-def test_a_configuration_that_rcl_refuses_leaves_nothing(
+def test_configuration_rejected_by_rcl_leaves_no_parts(
     inside: Callable[..., Inside], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     node = inside(journal=str(tmp_path / 'journal'), online=True, refine_poses=True).node
@@ -424,7 +420,7 @@ def test_a_configuration_that_rcl_refuses_leaves_nothing(
     assert result == TransitionCallbackReturn.SUCCESS and most > 15
 
 
-def test_a_clean_up_before_the_journal_is_read_leaves_nothing(inside: Callable[..., Inside]) -> None:
+def test_clean_up_while_the_journal_is_read_leaves_no_parts(inside: Callable[..., Inside]) -> None:
     node = inside().node
     assert node.trigger_configure() == TransitionCallbackReturn.SUCCESS
     part = weakref.ref(node.em)
@@ -434,7 +430,7 @@ def test_a_clean_up_before_the_journal_is_read_leaves_nothing(inside: Callable[.
     assert part() is None
 
 
-def test_a_topic_under_two_names_is_taken_once(inside: Callable[..., Inside]) -> None:
+def test_topic_under_two_names_is_subscribed_once(inside: Callable[..., Inside]) -> None:
     robot = inside(range_topics=['sonar', '/sonar', 'other'])
     robot.start()
     assert sorted(topic for topic in robot.node.intake.subscriptions if topic != '/odom') == ['/other', '/sonar']
@@ -443,8 +439,8 @@ def test_a_topic_under_two_names_is_taken_once(inside: Callable[..., Inside]) ->
 
 
 @pytest.mark.skipif(not Path('/proc/self/fd').is_dir(), reason='there is no /proc')
-def test_a_node_that_was_destroyed_leaves_the_middleware(inside: Callable[..., Inside]) -> None:
-    # the first one of a process opens what all of them share
+def test_destroyed_node_leaves_no_sockets(inside: Callable[..., Inside]) -> None:
+    # the first node of a process opens sockets that all nodes share
     inside().start().close()
     before = sockets()
     inside().start().close()

@@ -1,4 +1,4 @@
-"""The node under load, over DDS: calls by the thousand, messages that are lost, and a first start without kernels."""
+"""The node under load, over DDS: thousands of calls, lost messages, and a first start without kernels."""
 
 from __future__ import annotations
 
@@ -19,11 +19,11 @@ from std_srvs.srv import SetBool, Trigger
 
 CALLS = 2000
 FEWER = 200
-"""Of the services that are made as one of those with many."""
+"""Number of calls of services that are made like the one with many."""
 
 
 @pytest.mark.slow
-def test_two_thousand_calls_at_once_are_all_answered(start: Any, robot: Robot) -> None:
+def test_two_thousand_calls_at_once_get_responses(start: Any, robot: Robot) -> None:
     start(*OPTIONS)
     robot.meet()
     robot.play(circle(0, 50))
@@ -36,7 +36,7 @@ def test_two_thousand_calls_at_once_are_all_answered(start: Any, robot: Robot) -
         'save_maps': (Trigger, {}, CALLS),
     }
     for name, (kind, fields, count) in requests.items():
-        # a client keeps 10 answers unless asked otherwise
+        # a client keeps 10 responses by default
         client = robot.node.create_client(kind, f'{robot.name}/{name}', qos_profile=QoSProfile(depth=2 * count))
         robot.until(client.service_is_ready, 20.0, f'{name} is there')
         futures = [client.call_async(kind.Request(**fields)) for _ in range(count)]
@@ -48,8 +48,8 @@ def test_two_thousand_calls_at_once_are_all_answered(start: Any, robot: Robot) -
 
 
 @pytest.mark.slow
-def test_what_the_middleware_drops_is_counted_and_warned_of(start: Any, robot: Robot) -> None:
-    """The middleware keeps 2000 messages for a node that is stopped."""
+def test_messages_dropped_by_the_middleware_are_counted(start: Any, robot: Robot) -> None:
+    """The middleware keeps 2000 messages for a stopped node."""
     node = start(*OPTIONS)
     robot.meet()
     robot.play(circle(0, 50))
@@ -73,7 +73,7 @@ def test_what_the_middleware_drops_is_counted_and_warned_of(start: Any, robot: R
 
 
 @pytest.mark.slow
-def test_a_first_start_loses_nothing_and_shows_the_live_map_first(start: Any, robot: Robot, tmp_path: Path) -> None:
+def test_first_start_loses_no_messages_and_shows_the_live_map_first(start: Any, robot: Robot, tmp_path: Path) -> None:
     node = start(*OPTIONS, ready=False, NUMBA_CACHE_DIR=str(tmp_path / 'cache'))
     robot.meet()
     robot.listen()

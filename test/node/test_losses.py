@@ -1,4 +1,4 @@
-"""Lost messages are counted by the numbers of their publishers, or by gaps in the stamps of steady sensors."""
+"""Lost messages are counted by sequence numbers of publishers, or by gaps in the stamps of regular sensors."""
 
 from __future__ import annotations
 
@@ -17,12 +17,12 @@ def numbered(losses: Losses, *numbers: int) -> None:
         losses.taken({'publication_sequence_number': number}, 'sonar', 0)
 
 
-class Told:
+class LostMessages:
     def __init__(self, change: int) -> None:
         self.total_count_change = change
 
 
-def test_gaps_of_one_publisher() -> None:
+def test_gaps_in_the_numbers_of_one_publisher_are_counted() -> None:
     losses = Losses(lambda: 1)
     numbered(losses, *range(3001, 3100))
     assert losses.lost == 0
@@ -30,7 +30,7 @@ def test_gaps_of_one_publisher() -> None:
     assert losses.lost == 5 + 10_000
 
 
-def test_several_publishers_of_one_topic() -> None:
+def test_losses_of_several_publishers_are_estimated() -> None:
     losses = Losses(lambda: 3)
     streams = [list(range(1, 5000)), list(range(1, 4000)), list(range(700, 3000))]
     rng = random.Random(1)
@@ -46,7 +46,7 @@ def test_several_publishers_of_one_topic() -> None:
     assert abs(losses.lost - lost) <= 0.2 * lost
 
 
-def test_a_publisher_that_joins_or_starts_again_is_no_loss() -> None:
+def test_new_or_restarted_publisher_is_no_loss() -> None:
     losses = Losses(lambda: 2)
     numbered(losses, 10, 11, 12)
     numbered(losses, 1_000_000, 13, 1_000_001)
@@ -56,7 +56,7 @@ def test_a_publisher_that_joins_or_starts_again_is_no_loss() -> None:
     assert again.lost == 0
 
 
-def test_gaps_in_the_stamps_of_a_steady_sensor() -> None:
+def test_gaps_in_the_stamps_of_a_regular_sensor_are_counted() -> None:
     losses = Losses(lambda: 1)
     rng = random.Random(2)
     for k in [*range(200), *range(230, 400)]:
@@ -66,7 +66,7 @@ def test_gaps_in_the_stamps_of_a_steady_sensor() -> None:
     assert losses.lost == 60
 
 
-def test_a_sensor_without_a_rate_loses_nothing() -> None:
+def test_sensor_without_a_regular_rate_has_no_losses() -> None:
     losses = Losses(lambda: 1)
     rng = random.Random(3)
     stamp = 0
@@ -76,25 +76,25 @@ def test_a_sensor_without_a_rate_loses_nothing() -> None:
     assert losses.lost == 0
 
 
-def test_what_the_middleware_says_and_what_gaps_tell_count_once() -> None:
+def test_losses_from_middleware_and_gaps_are_counted_once() -> None:
     losses = Losses(lambda: 1)
     numbered(losses, 1, 2, 8)
-    losses.reported(Told(5))
+    losses.reported(LostMessages(5))
     assert losses.lost == 5
-    losses.reported(Told(3))
+    losses.reported(LostMessages(3))
     assert losses.lost == 8
     losses.clear()
     assert losses.lost == 0
     assert losses.recent + LASTING <= 0
-    losses.reported(Told(0))
+    losses.reported(LostMessages(0))
     assert losses.recent + LASTING <= 0, 'nothing was lost'
-    losses.reported(Told(2))
+    losses.reported(LostMessages(2))
     assert losses.lost == 2
     assert time.monotonic() - LASTING < losses.recent <= time.monotonic()
 
 
 def at_steps(losses: Losses, *steps: float, frame: str = 'sonar') -> list[int]:
-    """Messages of one sensor, so many usual intervals apart; returns what is lost after each."""
+    """Messages of one sensor at these multiples of the usual interval; returns the losses after each."""
     stamp, found = 10**9, []
     for step in (0.0, *steps):
         stamp += round(step * 100 * MILLISECOND)
@@ -103,31 +103,31 @@ def at_steps(losses: Losses, *steps: float, frame: str = 'sonar') -> list[int]:
     return found[1:]
 
 
-def test_a_sensor_is_steady_after_some_intervals_of_about_the_same_length() -> None:
-    # the first tells the interval
+def test_sensor_is_regular_after_some_similar_intervals() -> None:
+    # the first step determines the interval
     assert at_steps(Losses(lambda: 1), *[1.0] * STEADY, 4.0)[-1] == 0
     assert at_steps(Losses(lambda: 1), *[1.0] * (1 + STEADY), 4.0)[-1] == 3
     assert at_steps(Losses(lambda: 1), 1.0, *[1.25, 0.8] * (STEADY // 2), 4.0)[-1] == 3
 
 
 @pytest.mark.parametrize(('step', 'missing'), [(1.6, 0), (1.75, 1), (2.4, 1), (2.6, 2), (50.0, 49)])
-def test_how_many_intervals_are_missing(step: float, missing: int) -> None:
+def test_number_of_missing_intervals(step: float, missing: int) -> None:
     assert at_steps(Losses(lambda: 1), *[1.0] * 20, step)[-1] == missing
 
 
 @pytest.mark.parametrize('odd', [0.5, 1.5])
-def test_an_odd_interval_makes_a_sensor_unsteady(odd: float) -> None:
-    # from now on the odd one is the usual interval, and the next ones are no gaps
+def test_irregular_interval_makes_a_sensor_irregular(odd: float) -> None:
+    # from now on the irregular interval is the usual one, and the next ones are no gaps
     found = at_steps(Losses(lambda: 1), *[1.0] * 20, odd, 3.0, *[1.0] * STEADY, 3.0)
     assert found[-1] == 0
 
 
-def test_a_stamp_that_does_not_advance_changes_nothing() -> None:
+def test_stamp_that_does_not_advance_is_ignored() -> None:
     assert at_steps(Losses(lambda: 1), *[1.0] * 20, 0.0, 3.0)[-1] == 2
     assert at_steps(Losses(lambda: 1), *[1.0] * 20, -5.0, 1.0, 3.0)[-1] == 2
 
 
-def test_more_sensors_than_are_told_apart_are_left_out() -> None:
+def test_number_of_distinguished_sensors_is_bounded() -> None:
     losses = Losses(lambda: 1)
     for k in range(MOST_STREAMS + 1):
         at_steps(losses, frame=f'sonar_{k}')
@@ -136,7 +136,7 @@ def test_more_sensors_than_are_told_apart_are_left_out() -> None:
 
 
 @pytest.mark.parametrize(('gap', 'lost'), [(NEW_PUBLISHER_GAP, NEW_PUBLISHER_GAP - 1), (NEW_PUBLISHER_GAP + 1, 0)])
-def test_a_large_gap_is_another_publisher_where_there_is_one(gap: int, lost: int) -> None:
+def test_large_gap_with_several_publishers_is_no_loss(gap: int, lost: int) -> None:
     losses = Losses(lambda: 2)
     numbered(losses, 1000, 1000 + gap)
     assert losses.lost == lost

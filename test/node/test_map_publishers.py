@@ -1,4 +1,4 @@
-"""Topics and services of the maps: the newest of each, and none that was forgotten."""
+"""Topics and services of the maps: the newest map of each, and none from before a reset."""
 
 from __future__ import annotations
 
@@ -24,13 +24,13 @@ from forward_grid_mapper.node.grid_message import grid_message
 from forward_grid_mapper.node.map_publishers import MAPS, MapPublishers
 
 GRID = Grid(0.1, -20, 10, 3, 2)
-"""Its first cell is at x = -20, y = 10, in cells."""
+"""The first cell is at x = -20, y = 10, in cells."""
 
 CELLS = np.array([[-1, 0, 1], [1, 0, -1]], np.int8)
 
 
 class Publishing(PlainNode):
-    """A node whose topics and services are kept in lists."""
+    """A node with its messages and services in lists."""
 
     def __init__(self, **topics: str) -> None:
         super().__init__()
@@ -95,7 +95,7 @@ def answers(maps: MapPublishers, name: str) -> list[Any]:
     return got
 
 
-def test_a_map_as_a_message() -> None:
+def test_message_of_a_map() -> None:
     made = grid_message(GRID, CELLS, 'map', Time(sec=3, nanosec=5))
     assert (made.header.frame_id, made.header.stamp.sec, made.header.stamp.nanosec) == ('map', 3, 5)
     assert made.info.map_load_time == made.header.stamp
@@ -109,7 +109,7 @@ def test_a_map_as_a_message() -> None:
     assert list(grid_message(GRID, chances, 'map', Time()).data) == [-1, 0, 25, 26, 100, 100]
 
 
-def test_before_the_first_map_there_is_an_empty_one(maps: MapPublishers) -> None:
+def test_empty_map_is_returned_before_the_first_one(maps: MapPublishers) -> None:
     for name in MAPS:
         (message,) = answers(maps, name)
         assert (message.info.width, message.info.height, len(message.data)) == (0, 0, 0)
@@ -118,11 +118,11 @@ def test_before_the_first_map_there_is_an_empty_one(maps: MapPublishers) -> None
     assert grid == Grid(0.1, 0, 0, 1, 1) and cells.shape == (1, 1) and cells[0, 0] == -1
 
 
-def test_a_map_goes_out_and_is_kept(node: Publishing, maps: MapPublishers) -> None:
+def test_map_is_published_and_kept(node: Publishing, maps: MapPublishers) -> None:
     maps.publish('ml_map', 0, GRID, CELLS)
     (message,) = answers(maps, 'ml_map')
     assert node.sent == [('~/ml_map', message)] and maps.latest['ml_map'] is message
-    # tf2 refuses a leading slash
+    # tf2 rejects a leading slash
     assert message.header.frame_id == 'odom' and message.header.stamp.sec == 7
     assert maps.ml_map == (GRID, CELLS)
     for name in ('uncertainty_map', 'live_map'):
@@ -131,7 +131,7 @@ def test_a_map_goes_out_and_is_kept(node: Publishing, maps: MapPublishers) -> No
     assert maps.ml_map == (GRID, CELLS), 'only the ML map is'
 
 
-def test_of_maps_that_wait_only_the_newest_goes_out(node: Publishing, maps: MapPublishers) -> None:
+def test_only_the_newest_of_waiting_maps_is_published(node: Publishing, maps: MapPublishers) -> None:
     busy = Busy(maps)
     for width in (1, 2, 5):
         maps.publish('live_map', 0, Grid(0.1, 0, 0, width, 1), np.zeros((1, width), np.int8))
@@ -145,7 +145,7 @@ def test_of_maps_that_wait_only_the_newest_goes_out(node: Publishing, maps: MapP
     assert node.widths('live_map') == [5, 9]
 
 
-def test_maps_that_were_forgotten_do_not_come_back(node: Publishing, maps: MapPublishers) -> None:
+def test_maps_from_before_a_reset_are_not_published(node: Publishing, maps: MapPublishers) -> None:
     busy = Busy(maps)
     maps.publish('ml_map', 0, GRID, CELLS)
     maps.clear()
@@ -160,24 +160,24 @@ def test_maps_that_were_forgotten_do_not_come_back(node: Publishing, maps: MapPu
     assert node.widths('ml_map') == [1, 3]
 
 
-def test_a_map_that_is_asked_for_is_brought_up_to_date_if_it_can_be(node: Publishing) -> None:
-    asked: list[tuple[str, Callable[[], None], Callable[[str], object]]] = []
-    maps = MapPublishers(node, 0.1, lambda: 'map', lambda *rest: asked.append(rest))
+def test_requested_map_is_updated_before_the_response(node: Publishing) -> None:
+    requests: list[tuple[str, Callable[[], None], Callable[[str], object]]] = []
+    maps = MapPublishers(node, 0.1, lambda: 'map', lambda *rest: requests.append(rest))
     got: list[Any] = []
     for _ in range(2):
         maps._get('live_map', SimpleNamespace(send=got.append))
-    assert got == [] and [name for name, _, _ in asked] == ['live_map', 'live_map']
+    assert got == [] and [name for name, _, _ in requests] == ['live_map', 'live_map']
     maps.publish('live_map', 0, GRID, CELLS)
-    asked[0][1]()
+    requests[0][1]()
     maps.worker.ask(lambda: None)
     assert [message.info.width for message in got] == [3]
-    # what cannot be is better than no answer
-    asked[1][2]('no memory')
+    # if the update fails, the last map is returned
+    requests[1][2]('no memory')
     assert [message.info.width for message in got] == [3, 3]
     maps.worker.close(10.0)
 
 
-def test_a_map_that_cannot_be_sent_keeps_no_other_and_no_answer(
+def test_map_that_cannot_be_published_blocks_no_others(
     node: Publishing, maps: MapPublishers, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def fail(*rest: Any) -> Any:
@@ -193,13 +193,13 @@ def test_a_map_that_cannot_be_sent_keeps_no_other_and_no_answer(
     assert answers(maps, 'ml_map')[0].info.width == 3
 
 
-def test_who_sends_does_not_give_way(maps: MapPublishers) -> None:
-    """It would take the executor along, since it holds the GIL."""
+def test_publishing_thread_has_normal_priority(maps: MapPublishers) -> None:
+    """A lower priority would slow down the executor, since the thread holds the GIL."""
     found = maps.worker.ask(lambda: os.getpriority(os.PRIO_PROCESS, threading.get_native_id()))
     assert found == os.getpriority(os.PRIO_PROCESS, 0)
 
 
-def test_updates_are_of_the_live_map_alone(node: Publishing, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_only_the_live_map_has_updates(node: Publishing, monkeypatch: pytest.MonkeyPatch) -> None:
     updates = SimpleNamespace(published=[], stale=False, refreshed=0)
     updates.publish = updates.published.append
     updates.refresh = lambda: setattr(updates, 'refreshed', updates.refreshed + 1)
@@ -218,7 +218,7 @@ def test_updates_are_of_the_live_map_alone(node: Publishing, monkeypatch: pytest
     maps.worker.close(10.0)
 
 
-def test_two_maps_cannot_have_one_topic(node: Publishing) -> None:
+def test_two_maps_on_one_topic_are_rejected(node: Publishing) -> None:
     node.topics = {'ml_map': '/map', 'live_map': '/map'}
     with pytest.raises(MapperError, match=r'^/map can have only one map'):
         MapPublishers(node, 0.1, lambda: 'map', at_once)
@@ -226,7 +226,7 @@ def test_two_maps_cannot_have_one_topic(node: Publishing) -> None:
     MapPublishers(node, 0.1, lambda: 'map', at_once)
 
 
-def test_where_no_thread_can_start_the_next_map_tries_again(
+def test_next_map_retries_a_failed_start_of_the_thread(
     node: Publishing, maps: MapPublishers, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def fail(thread: threading.Thread) -> None:
@@ -241,11 +241,11 @@ def test_where_no_thread_can_start_the_next_map_tries_again(
     assert [message.info.height for _, message in node.sent] == [1]
 
 
-def test_a_map_that_comes_while_another_one_fails_is_published(node: Publishing, maps: MapPublishers) -> None:
+def test_map_that_comes_during_a_failure_is_published(node: Publishing, maps: MapPublishers) -> None:
     newer = Grid(0.1, 0, 0, 3, 1), np.zeros((1, 3), np.float32)
 
     def fail(*arguments: Any) -> None:
-        # once: the newer one comes while this one is made
+        # only once: the newer map comes while this one is made
         patch.undo()
         maps.publish('live_map', 0, *newer)
         raise MemoryError

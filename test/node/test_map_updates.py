@@ -1,4 +1,4 @@
-"""Updates of the live map, with a stand-in for map_msgs: whoever listens has the latest map, however he listens."""
+"""Updates of the live map, with a stand-in for map_msgs: all subscribers have the latest map."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ from forward_grid_mapper.node.mapper_node import MapperNode
 
 
 class Update:
-    """Stands in for `map_msgs/OccupancyGridUpdate`: std_msgs/Header, int32 x and y, uint32 width and height, int8[]."""
+    """Stand-in for `map_msgs/OccupancyGridUpdate`: std_msgs/Header, int32 x and y, uint32 width and height, int8[]."""
 
     def __init__(self) -> None:
         self.header = Header()
@@ -42,7 +42,7 @@ def cells(message: Any) -> Any:
 
 
 class Listener:
-    """Puts parts and wholes together as RViz and Nav2's static layer do; `follows` says whether it takes updates."""
+    """Combines maps and updates like RViz and the static layer of Nav2; subscribes to updates if `follows`."""
 
     numbers = itertools.count()
 
@@ -58,7 +58,7 @@ class Listener:
     def part(self, update: Update) -> None:
         if self.map is None or not self.follows:
             return
-        # whatever is not so is refused there, with a warning
+        # otherwise the update is rejected there with a warning
         assert update.header.frame_id == self.map.header.frame_id
         assert update.x >= 0 and update.x + update.width <= self.map.info.width
         assert update.y >= 0 and update.y + update.height <= self.map.info.height
@@ -66,7 +66,7 @@ class Listener:
 
 
 class Network:
-    """A node, its publishers, and those who listen; the topic of the map keeps its last message."""
+    """A node with publishers and listeners; the topic of the map keeps its last message."""
 
     def __init__(self) -> None:
         self.listeners: list[Listener] = []
@@ -116,7 +116,7 @@ def message(values: Any, column: int = 0, frame: str = 'odom') -> OccupancyGrid:
     return grid_message(grid, values, frame, Time(sec=5))
 
 
-def test_the_box_holds_what_differs_and_no_more() -> None:
+def test_box_is_the_smallest_with_all_changes() -> None:
     rng = np.random.default_rng(0)
     for _ in range(300):
         shape = tuple(rng.integers(1, 8, 2))
@@ -130,7 +130,7 @@ def test_the_box_holds_what_differs_and_no_more() -> None:
         assert box == Box(min(xs), min(ys), max(xs) - min(xs) + 1, max(ys) - min(ys) + 1)
 
 
-def test_a_follower_gets_only_what_changed(network: Network, updates: MapUpdates) -> None:
+def test_subscriber_of_updates_gets_only_changes(network: Network, updates: MapUpdates) -> None:
     rviz = network.join('rviz', follows=True)
     values = np.zeros((6, 9), np.int8)
     updates.publish(message(values))
@@ -146,7 +146,7 @@ def test_a_follower_gets_only_what_changed(network: Network, updates: MapUpdates
     assert len(network.sent) == 2
 
 
-def test_who_does_not_follow_gets_whole_maps(network: Network, updates: MapUpdates) -> None:
+def test_subscriber_without_updates_gets_whole_maps(network: Network, updates: MapUpdates) -> None:
     network.join('rviz', follows=True)
     network.join('amcl', follows=False)
     for k in range(5):
@@ -154,22 +154,20 @@ def test_who_does_not_follow_gets_whole_maps(network: Network, updates: MapUpdat
     assert all(isinstance(sent, OccupancyGrid) for sent in network.sent) and len(network.sent) == 5
 
 
-def test_without_listeners_the_whole_map_is_kept_for_those_who_come(network: Network, updates: MapUpdates) -> None:
+def test_without_subscribers_the_whole_map_is_published(network: Network, updates: MapUpdates) -> None:
     for k in range(3):
         updates.publish(message(np.full((2, 2), k % 2, np.int8)))
     assert all(isinstance(sent, OccupancyGrid) for sent in network.sent)
 
 
-def test_a_node_whose_name_is_not_known_yet_gets_whole_maps(network: Network, updates: MapUpdates) -> None:
+def test_subscriber_with_unknown_name_gets_whole_maps(network: Network, updates: MapUpdates) -> None:
     network.join(map_updates.UNKNOWN, follows=True)
     for k in range(3):
         updates.publish(message(np.full((2, 2), k % 2, np.int8)))
     assert all(isinstance(sent, OccupancyGrid) for sent in network.sent)
 
 
-def test_who_comes_late_gets_the_latest_map_even_if_nothing_changes_any_more(
-    network: Network, updates: MapUpdates
-) -> None:
+def test_late_subscriber_gets_the_latest_map_without_changes(network: Network, updates: MapUpdates) -> None:
     network.join('rviz', follows=True)
     values = np.zeros((3, 3), np.int8)
     updates.publish(message(values))
@@ -186,9 +184,7 @@ def test_who_comes_late_gets_the_latest_map_even_if_nothing_changes_any_more(
     assert len(network.sent) == sent
 
 
-def test_now_and_then_the_whole_map_is_sent(
-    network: Network, updates: MapUpdates, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_whole_map_is_sent_at_intervals(network: Network, updates: MapUpdates, monkeypatch: pytest.MonkeyPatch) -> None:
     now = 1000.0
     monkeypatch.setattr(map_updates.time, 'monotonic', lambda: now)
     network.join('rviz', follows=True)
@@ -201,10 +197,10 @@ def test_now_and_then_the_whole_map_is_sent(
 
 
 @pytest.mark.parametrize('seed', range(40))
-def test_everybody_has_the_latest_map_whatever_happens(network: Network, updates: MapUpdates, seed: int) -> None:
+def test_all_subscribers_have_the_latest_map_in_random_cases(network: Network, updates: MapUpdates, seed: int) -> None:
     rng = np.random.default_rng(seed)
     values, column, frame = np.zeros((3, 4), np.int8), 0, 'odom'
-    # most cases have followers alone, so that parts are sent at all
+    # in most cases all subscribe to updates, so that updates are sent at all
     others = seed % 3 == 0
     for _ in range(60):
         what = rng.random()
@@ -216,7 +212,7 @@ def test_everybody_has_the_latest_map_whatever_happens(network: Network, updates
             values = np.pad(values, ((0, int(rng.integers(3))), (int(rng.integers(3)), 0)), constant_values=-1)
             column -= 1
         elif what < 0.36:
-            # of the same size, but elsewhere
+            # the same size at another place
             values, column = np.roll(values, 1, axis=1), column + 1
         elif what < 0.39:
             frame = {'odom': 'map', 'map': 'odom'}[frame]
@@ -233,10 +229,8 @@ def test_everybody_has_the_latest_map_whatever_happens(network: Network, updates
     assert others or any(isinstance(sent, Update) for sent in network.sent)
 
 
-def test_the_node_sends_them_beside_its_live_map(
-    inside: Callable[..., Inside], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """They have the name of the live map's topic, however that is remapped."""
+def test_node_publishes_updates_of_its_live_map(inside: Callable[..., Inside], monkeypatch: pytest.MonkeyPatch) -> None:
+    """Their topic is named after that of the live map, also if it is remapped."""
     modules = {name: ModuleType(name) for name in ('map_msgs', 'map_msgs.msg')}
     modules['map_msgs.msg'].OccupancyGridUpdate = Update  # type: ignore[attr-defined]
     for name, module in modules.items():
@@ -259,7 +253,7 @@ def test_the_node_sends_them_beside_its_live_map(
     robot.until(lambda: robot.node.maps.latest['live_map'].info.width)
     wholes: list[OccupancyGrid] = []
     monkeypatch.setattr(robot.node.maps._out['live_map'], 'publish', wholes.append)
-    # the same again changes how sure the map is, not its size
+    # the same readings again change probabilities, not the size of the map
     for k in range(20):
         robot.odometry(200.0 + 0.05 * k, 0.001 * k)
         robot.range(200.0 + 0.05 * k)
@@ -267,7 +261,7 @@ def test_the_node_sends_them_beside_its_live_map(
     latest = robot.node.maps.latest['live_map']
     assert not wholes
     assert 0 < sent[0].width <= latest.info.width
-    # somebody comes who does not follow, when nothing changes any more
+    # a subscriber without updates comes when the map no longer changes
     robot.until(lambda: not robot.node.maps.worker.waiting)
     everybody = {b'1': ('/', 'rviz'), b'2': ('/', 'saver')}
     monkeypatch.setattr(

@@ -1,4 +1,4 @@
-"""The node over real DDS, from a second process."""
+"""The node in a second process, over DDS."""
 
 from __future__ import annotations
 
@@ -52,9 +52,7 @@ def values(message: OccupancyGrid) -> np.ndarray:
     return np.array(message.data, np.int8).reshape(message.info.height, message.info.width)
 
 
-def test_a_drive_becomes_three_maps_that_late_subscribers_get(
-    start: Any, robot: Robot, door: Recording, tmp_path: Path
-) -> None:
+def test_drive_gives_three_maps_to_late_subscribers(start: Any, robot: Robot, door: Recording, tmp_path: Path) -> None:
     start(*RELIABLE, *extrinsics(door), '-p', f'save_directory:={tmp_path}/maps here', '-p', 'publish_rate:=5.0')
     robot.meet()
     assert robot.get_map('ml_map').info.width == 0
@@ -84,7 +82,7 @@ def test_a_drive_becomes_three_maps_that_late_subscribers_get(
     assert names >= {'live_map.pgm', 'ml_map.yaml', 'maps.npz', 'report.json', 'report.txt', 'report.html'}
     assert f', and {len(names) - 3} files more' in first.message
     assert folder != other and {path.name for path in other.iterdir()} == names
-    # what is published is what is saved
+    # published maps equal saved maps
     for name in MAPS:
         message = robot.maps[name][-1]
         grid, saved = read_map(folder / f'{name}.yaml')
@@ -95,7 +93,7 @@ def test_a_drive_becomes_three_maps_that_late_subscribers_get(
 
 
 def compare(robot: Robot, bag: Path, out: Path, *options: str) -> None:
-    """Save the node's maps and compare them with those that process_bag makes of the bag."""
+    """Save the maps of the node, and compare them with those of process_bag."""
     assert robot.call('run_em').success
     saved = robot.call('save_maps')
     assert saved.success, saved.message
@@ -112,7 +110,7 @@ def compare(robot: Robot, bag: Path, out: Path, *options: str) -> None:
 
 
 def replay(start: Any, robot: Robot, path: Path, tmp_path: Path, odom_topic: str | None = None) -> None:
-    """Send a bag's messages to a node that has the bag's sensor poses, and compare its maps with the offline ones."""
+    """Replay a bag to a node with the sensor poses of the bag, and compare its maps with the offline ones."""
     with Bag(path) as bag:
         transforms = bag.static_transforms()
         messages = list(bag.messages(bag.choose_topics(None, odom_topic)))
@@ -140,9 +138,9 @@ def test_node_and_offline_agree_on_a_simulated_drive(start: Any, robot: Robot, d
     replay(start, robot, write_recording(tmp_path / 'sim', door), tmp_path)
 
 
-def test_the_grid_lies_where_the_world_does(start: Any, robot: Robot, tmp_path: Path) -> None:
-    # two walls, seen from a place off the origin; their surfaces lie a little before the centres of their cells, which
-    # are 1 m to the left and 2 m ahead
+def test_grid_is_at_the_place_of_the_world(start: Any, robot: Robot, tmp_path: Path) -> None:
+    # Two walls, seen from a place off the origin. Their surfaces are a little in front of the centres of their cells,
+    # which are 1 m to the left and 2 m ahead.
     start(*RELIABLE, '-p', 'sensors.left.pose:=[0.0, 0.0, 1.5707963]', '-p', 'sensors.front.pose:=[0.0, 0.0, 0.0]')
     robot.meet()
     messages: list[Any] = []
@@ -169,7 +167,7 @@ def test_the_grid_lies_where_the_world_does(start: Any, robot: Robot, tmp_path: 
     assert (((x > 6.8) & (np.abs(y + 3.05) < 0.4)) | ((y > -2.3) & (np.abs(x - 5.05) < 0.3))).all()
 
 
-def test_services_during_em_and_reset(start: Any, robot: Robot) -> None:
+def test_services_during_em_and_after_reset(start: Any, robot: Robot) -> None:
     recording = corridor_drive(0)
     node = start(*RELIABLE, *extrinsics(recording), '-p', 'resolution:=0.02', '-p', 'publish_rate:=4.0')
     robot.meet()
@@ -182,7 +180,7 @@ def test_services_during_em_and_reset(start: Any, robot: Robot) -> None:
     second = robot.call('run_em')
     assert not second.success
     assert 'already running' in second.message
-    # live mapping goes on, and the map found so far can be watched
+    # live mapping continues, and the intermediate map is published
     before = len(robot.maps['live_map'])
     robot.play(messages[most : most + 200], rate=400.0)
     assert not first.done(), 'EM must last longer than this for the test to show anything'
@@ -202,7 +200,7 @@ def test_services_during_em_and_reset(start: Any, robot: Robot) -> None:
     assert 'no Range message has been received on /sonar' in empty.message
     save = robot.call('save_maps')
     assert not save.success
-    # a run that is under way does not keep the node from ending
+    # a running search does not prevent the node from ending
     robot.sent = 0
     robot.play(messages[: len(messages) // 2])
     robot.ask('run_em')
@@ -210,7 +208,7 @@ def test_services_during_em_and_reset(start: Any, robot: Robot) -> None:
     assert node.stop(signal.SIGTERM) == 0
 
 
-def test_parameters_are_checked(start: Any, robot: Robot, door: Recording) -> None:
+def test_parameters_are_checked_at_run_time(start: Any, robot: Robot, door: Recording) -> None:
     start(*RELIABLE, *extrinsics(door), '-p', 'prior:=0.5', '-p', 'p_hitt:=0.4', '-p', 'alpha:=1')
     robot.meet()
     assert robot.get_parameter('prior').double_value == 0.5
@@ -229,7 +227,7 @@ def test_parameters_are_checked(start: Any, robot: Robot, door: Recording) -> No
     for name, value in (('p_hit', 0.9), ('max_iterations', 100), ('sigma', 1), ('publish_rate', 10.0)):
         result = robot.set_parameter(name, value)
         assert result.successful, result.reason
-    # neither a wrong type nor a whole number changes what a parameter is declared as
+    # the declared type of a parameter stays, after wrong types and whole numbers
     for name, value in (('p_hit', 0.9), ('sigma', 1.0)):
         assert robot.get_parameter(name).type == ParameterType.PARAMETER_DOUBLE
         assert robot.get_parameter(name).double_value == value
@@ -239,7 +237,7 @@ def test_parameters_are_checked(start: Any, robot: Robot, door: Recording) -> No
     assert robot.call('run_em').message.split('objective')[1] != first.split('objective')[1]
 
 
-def test_a_bad_value_at_start_is_an_error(start: Any) -> None:
+def test_bad_value_at_start_is_an_error(start: Any) -> None:
     node = start('-p', 'p_hit:=2.0', ready=False)
     assert node.process.wait(60) == 1
     assert 'p_hit' in node.output
@@ -253,13 +251,13 @@ def test_one_topic_for_ranges_and_odometry_is_an_error(start: Any) -> None:
     assert 'Traceback' not in node.output
 
 
-def test_misspelt_parameters_are_named(start: Any) -> None:
+def test_misspelt_parameter_is_named(start: Any) -> None:
     node = start('-p', 'p_hitt:=0.5', '-p', 'save_directory:=/proc/version/maps')
     assert 'did you mean p_hit' in node.output
     assert 'save_maps will fail: /proc/version is not a folder' in node.output
 
 
-def test_trouble_shows_in_diagnostics_and_passes(start: Any, robot: Robot) -> None:
+def test_faults_are_in_the_diagnostics_until_they_end(start: Any, robot: Robot) -> None:
     node = start(*RELIABLE, '-p', 'sensors.sonar.pose:=[0.0, 0.0, 0.0]')
     robot.meet()
 
@@ -286,7 +284,7 @@ def test_trouble_shows_in_diagnostics_and_passes(start: Any, robot: Robot) -> No
     assert readings()['level'] != b'\x00'
     robot.play(second(120.0))
     robot.until(lambda: 'no odometry' not in readings()['message'], what='the warning passes')
-    # the bag loops: what waits is dropped, the map is kept
+    # the bag loops: waiting readings are dropped, the map is kept
     accepted = int(readings()['readings accepted'])
     robot.play(second(100.0))
     robot.until(lambda: int(readings()['clock jumps back']) == 1, what='the jump is counted')
@@ -296,7 +294,7 @@ def test_trouble_shows_in_diagnostics_and_passes(start: Any, robot: Robot) -> No
     assert total == int(readings()['readings received'])
 
 
-def test_ranges_in_millimetres_show_in_diagnostics_until_reset(start: Any, robot: Robot) -> None:
+def test_ranges_in_millimetres_give_a_warning_until_reset(start: Any, robot: Robot) -> None:
     start(*RELIABLE, '-p', 'sensors.sonar.pose:=[0.0, 0.0, 0.0]')
     robot.meet()
     messages: list[Any] = []
@@ -311,7 +309,7 @@ def test_ranges_in_millimetres_show_in_diagnostics_until_reset(start: Any, robot
     robot.until(lambda: 'millimetres' not in robot.diagnostics['readings']['message'], what='the warning passes')
 
 
-def test_pause(start: Any, robot: Robot) -> None:
+def test_pause_rejects_readings(start: Any, robot: Robot) -> None:
     start(*RELIABLE, '-p', 'sensors.sonar.pose:=[0.0, 0.0, 0.0]')
     robot.meet()
     messages: list[Any] = []
@@ -326,7 +324,7 @@ def test_pause(start: Any, robot: Robot) -> None:
     assert robot.diagnostics['readings']['readings accepted'] == '5'
 
 
-def test_two_nodes_in_two_namespaces(start: Any, domain: int) -> None:
+def test_two_nodes_in_two_namespaces_map_separately(start: Any, domain: int) -> None:
     for name in ('one', 'two'):
         start(*RELIABLE, '-r', f'__ns:=/{name}', '-p', 'sensors.sonar.pose:=[0.0, 0.0, 0.0]')
     robots = [Robot(domain, f'/{name}/forward_grid_mapper', f'/{name}/') for name in ('one', 'two')]
@@ -347,13 +345,13 @@ def test_two_nodes_in_two_namespaces(start: Any, domain: int) -> None:
             robot.close()
 
 
-def test_sim_time_stamps_the_maps(start: Any, robot: Robot) -> None:
+def test_maps_have_stamps_of_simulated_time(start: Any, robot: Robot) -> None:
     start(*RELIABLE, '-p', 'use_sim_time:=true', '-p', 'sensors.sonar.pose:=[0.0, 0.0, 0.0]')
     robot.meet()
     clock = robot.node.create_publisher(Clock, '/clock', 10)
     now = Clock()
     now.clock.sec = 42
-    # the node may discover the publisher after what was sent first, and keeps only what came
+    # the node may discover the publisher after the first messages, and keeps only what it received
     robot.node.create_timer(0.05, lambda: clock.publish(now))
     robot.until(lambda: robot.time == 42, what='the node has the time')
     robot.play(
@@ -369,13 +367,13 @@ def test_sim_time_stamps_the_maps(start: Any, robot: Robot) -> None:
 @pytest.mark.parametrize(
     ('number', 'times'), [(signal.SIGINT, 1), (signal.SIGINT, 2), (signal.SIGTERM, 1), (signal.SIGHUP, 1)]
 )
-def test_signals_end_the_node_in_order(start: Any, number: signal.Signals, times: int) -> None:
+def test_signals_end_the_node_normally(start: Any, number: signal.Signals, times: int) -> None:
     node = start()
     assert node.stop(number, times) == 0
     assert 'Traceback' not in node.output
 
 
-def test_a_node_under_nohup_survives_its_terminal(start: Any) -> None:
+def test_node_under_nohup_survives_its_terminal(start: Any) -> None:
     before = signal.signal(signal.SIGHUP, signal.SIG_IGN)
     try:
         node = start()
@@ -387,7 +385,7 @@ def test_a_node_under_nohup_survives_its_terminal(start: Any) -> None:
     assert node.stop() == 0
 
 
-def test_a_signal_while_kernels_compile_ends_the_node(start: Any, tmp_path: Path) -> None:
+def test_signal_during_compilation_ends_the_node(start: Any, tmp_path: Path) -> None:
     node = start(ready=False, NUMBA_CACHE_DIR=str(tmp_path / 'cache'))
     node.wait_for('preparing kernels')
     time.sleep(1.0)

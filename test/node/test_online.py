@@ -1,4 +1,4 @@
-"""The node's online map, over DDS."""
+"""The online map of the node, over DDS."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from forward_grid_mapper.simulation.score import score_map, visible_surface
 from forward_grid_mapper.simulation.sonar import NOISY
 
 
-def test_maps_follow_the_readings_and_em_polishes_them(start: Any, robot: Robot, tmp_path: Path) -> None:
+def test_online_maps_follow_the_readings_and_em_improves_them(start: Any, robot: Robot, tmp_path: Path) -> None:
     door = door_drive(16, NOISY, seed=3)
     options = ('-p', 'online:=true', '-p', 'publish_rate:=10.0', '-p', f'save_directory:={tmp_path}')
     start(*RELIABLE, *extrinsics(door), *options)
@@ -57,17 +57,17 @@ def test_maps_follow_the_readings_and_em_polishes_them(start: Any, robot: Robot,
     assert answer.success, answer.message
     found = re.search(r'objective (-?[\d.]+)', answer.message)
     assert found
-    # from the online map the search may end at another top, as high within a few nats
+    # from the online map, the search may end at another optimum, with about the same objective
     assert float(found.group(1)) > batch.objective - 0.02 * abs(batch.objective)
-    polished = robot.until(lambda: robot.maps['ml_map'][-1], what='the map of EM')
-    assert f1(polished) > 0.9
+    improved = robot.until(lambda: robot.maps['ml_map'][-1], what='the map of EM')
+    assert f1(improved) > 0.9
 
     robot.call('reset')
     robot.spin(0.5)
     assert np.all(values(robot.maps['ml_map'][-1]) == -1)
 
 
-def test_parameters_may_change_while_it_runs(start: Any, robot: Robot) -> None:
+def test_parameters_can_change_at_run_time(start: Any, robot: Robot) -> None:
     door = door_drive(1, NOISY, seed=1)
     node = start(*RELIABLE, *extrinsics(door), '-p', 'online:=true', '-p', 'publish_rate:=10.0')
     robot.meet()

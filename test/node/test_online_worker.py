@@ -1,4 +1,4 @@
-"""The online map in the background: what is shown, how often, and what becomes of commands for a map given up."""
+"""The online map in the background: publishing, its rate, and commands for a map that was replaced."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def readings(count: int) -> Readings:
 
 
 class PlainMap:
-    """As much of an online map as its worker asks for: counts readings, and raises what the test has it raise."""
+    """Stand-in for an online map, with what its worker needs: counts readings, and raises errors set by the test."""
 
     made: list[PlainMap]
     error: BaseException | None
@@ -78,7 +78,7 @@ class PlainMap:
 
 
 class Node:
-    """The thread that owns a worker, and what it was given."""
+    """The thread that owns a worker, and the snapshots it received."""
 
     def __init__(self, parameters: Parameters = QUICK) -> None:
         self.shown: list[OnlineSnapshot] = []
@@ -90,19 +90,19 @@ class Node:
         self.worker.worker.ask(lambda: None)
 
     def tick(self) -> None:
-        """Look whether it is to be published, when it is time."""
+        """Call `tick` when it is time to publish."""
         while (left := self.worker._next - time.monotonic()) > 0:
             assert left < 1.0
             time.sleep(left)
         self.worker.tick()
 
     def publish(self) -> None:
-        """The same, and wait until it is."""
+        """Call `tick` when it is time, and wait until the map is published."""
         self.tick()
         self.settle()
 
     def hold(self) -> Callable[[], None]:
-        """Keep its thread busy until what is returned is called."""
+        """Keep the worker busy until the returned function is called."""
         begun, go_on = threading.Event(), threading.Event()
 
         def work() -> None:
@@ -128,7 +128,7 @@ def node(maps: type[PlainMap]) -> Iterator[Node]:
     made.worker.close(10.0)
 
 
-def test_readings_are_added_where_they_are_placed_and_shown(node: Node, maps: type[PlainMap]) -> None:
+def test_readings_are_added_and_published(node: Node, maps: type[PlainMap]) -> None:
     assert node.prepared.wait(60.0)
     assert (node.worker.epoch, node.worker.kept, node.worker.so_far()) == (0, 0, None)
     node.worker.tick()
@@ -151,7 +151,7 @@ def test_readings_are_added_where_they_are_placed_and_shown(node: Node, maps: ty
     assert len(node.shown) == 2
 
 
-def test_it_is_shown_as_often_as_asked_and_not_twice_at_once(maps: type[PlainMap]) -> None:
+def test_map_is_published_at_the_rate_and_not_twice_at_once(maps: type[PlainMap]) -> None:
     node = Node(Parameters.from_flat({'publish_rate': 0.1}))
     for _ in range(3):
         node.worker.offer(readings(1))
@@ -160,7 +160,7 @@ def test_it_is_shown_as_often_as_asked_and_not_twice_at_once(maps: type[PlainMap
         node.settle()
     assert len(node.shown) == 1
     assert 5.0 < node.worker._next - time.monotonic() <= 10.0
-    # a new rate counts at once
+    # a new rate is used at once
     node.worker.change(QUICK)
     node.worker.tick()
     node.settle()
@@ -177,7 +177,7 @@ def test_it_is_shown_as_often_as_asked_and_not_twice_at_once(maps: type[PlainMap
     node.worker.close(10.0)
 
 
-def test_a_new_beginning_drops_what_was_meant_for_the_map_before(node: Node, maps: type[PlainMap]) -> None:
+def test_restart_drops_readings_for_the_earlier_map(node: Node, maps: type[PlainMap]) -> None:
     node.worker.offer(readings(3))
     node.publish()
     go_on = node.hold()
@@ -203,11 +203,11 @@ def test_a_new_beginning_drops_what_was_meant_for_the_map_before(node: Node, map
     assert len(node.shown) == shown + 1, "an empty map is nobody's"
 
 
-def test_no_snapshot_of_a_map_that_is_given_up_just_then_is_started_from(node: Node, maps: type[PlainMap]) -> None:
+def test_run_does_not_start_from_a_map_replaced_at_that_moment(node: Node, maps: type[PlainMap]) -> None:
     worker = node.worker
 
     class Epoch(int):
-        """Lets the map be given up while the worker compares its epoch with that of a snapshot."""
+        """Lets the map be replaced while the worker compares its epoch with that of a snapshot."""
 
         def __eq__(self, other: Any) -> bool:
             threading.Thread(target=restart).start()
@@ -233,7 +233,7 @@ def test_no_snapshot_of_a_map_that_is_given_up_just_then_is_started_from(node: N
     assert worker.epoch == 1 and worker.so_far() is None
 
 
-def test_it_goes_on_from_the_map_of_em(node: Node, maps: type[PlainMap]) -> None:
+def test_online_map_continues_from_the_map_of_em(node: Node, maps: type[PlainMap]) -> None:
     searched = np.ones(GRID.shape, np.int8)
     node.worker.offer(readings(3))
     go_on = node.hold()
@@ -249,7 +249,7 @@ def test_it_goes_on_from_the_map_of_em(node: Node, maps: type[PlainMap]) -> None
     assert maps.made[0].adopted == 1 and node.shown[0].epoch == 1
 
 
-def test_cancelling_is_no_trouble(node: Node, maps: type[PlainMap]) -> None:
+def test_cancelling_gives_no_error(node: Node, maps: type[PlainMap]) -> None:
     node.worker.offer(readings(1))
     node.settle()
     maps.made[0].cancelled = True
@@ -266,7 +266,7 @@ def test_cancelling_is_no_trouble(node: Node, maps: type[PlainMap]) -> None:
 @pytest.mark.parametrize(
     ('error', 'why'), [(MemoryError(), 'there is not enough memory'), (InputError('max_cells'), 'max_cells')]
 )
-def test_readings_that_do_not_fit_are_told_of_until_the_next_beginning(
+def test_readings_that_could_not_be_added_are_reported_until_restart(
     node: Node, maps: type[PlainMap], error: BaseException, why: str
 ) -> None:
     maps.error = error
@@ -283,16 +283,16 @@ def test_readings_that_do_not_fit_are_told_of_until_the_next_beginning(
     assert node.worker.worker.trouble == ''
 
 
-def test_readings_that_were_taken_are_not_said_to_be_missing(node: Node, maps: type[PlainMap]) -> None:
+def test_added_readings_are_not_reported_as_missing(node: Node, maps: type[PlainMap]) -> None:
     maps.late = MemoryError()
     node.worker.offer(readings(3))
     node.settle()
-    said = 'online map: the search will continue with the next readings: there is not enough memory'
-    assert node.logged == [said]
+    expected = 'online map: the search will continue with the next readings: there is not enough memory'
+    assert node.logged == [expected]
     assert node.worker.worker.trouble == '' and node.worker.kept == 3
 
 
-def test_a_map_that_cannot_be_shown_is_shown_later_without_further_readings(node: Node, maps: type[PlainMap]) -> None:
+def test_failed_map_is_published_later_without_new_readings(node: Node, maps: type[PlainMap]) -> None:
     node.worker.offer(readings(1))
     node.settle()
     maps.error = MemoryError()
@@ -303,7 +303,7 @@ def test_a_map_that_cannot_be_shown_is_shown_later_without_further_readings(node
     assert len(node.shown) == 1
 
 
-def test_closing_gives_the_map_up(node: Node, maps: type[PlainMap]) -> None:
+def test_closing_cancels_the_map(node: Node, maps: type[PlainMap]) -> None:
     node.settle()
     node.worker.close(10.0)
     assert maps.made[0].cancelled

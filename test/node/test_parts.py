@@ -1,4 +1,4 @@
-"""The parts of the node, looked at from inside: nothing keeps the executor for long, and everybody is answered."""
+"""The parts of the node from inside: nothing blocks the executor for long, and all calls get responses."""
 
 from __future__ import annotations
 
@@ -41,12 +41,12 @@ LONG_WORK: tuple[tuple[Any, str], ...] = (
     (map_publishers, 'grid_message'),
     (saver, 'write_results'),
 )
-"""What takes as long as there are readings, or as the map is large."""
+"""Functions whose time grows with the number of readings or the size of the map."""
 
 
 @pytest.fixture
 def watched(monkeypatch: pytest.MonkeyPatch) -> list[str]:
-    """Names of long work that the thread of the test, which turns the executor, was made to do."""
+    """Names of long work that was done by the thread of the test, which turns the executor."""
     found: list[str] = []
     executor = threading.get_ident()
 
@@ -65,13 +65,13 @@ def watched(monkeypatch: pytest.MonkeyPatch) -> list[str]:
     return found
 
 
-def test_the_executor_does_no_long_work(inside: Callable[..., Inside], watched: list[str], tmp_path: Path) -> None:
+def test_executor_does_no_long_work(inside: Callable[..., Inside], watched: list[str], tmp_path: Path) -> None:
     options = {'online': True, 'max_readings': 400, 'journal': str(tmp_path / 'journal'), 'publish_rate': 50.0}
     for _ in range(2):
         robot = inside(**options)
         node = robot.node
         robot.node.start()
-        # the empty maps of the start are a cell each
+        # the empty maps of the start have one cell each
         watched.clear()
         robot.until(lambda node=node: node.mapping)
         robot.drive(len(node.associator.buffer), 1000)
@@ -93,14 +93,14 @@ def test_the_executor_does_no_long_work(inside: Callable[..., Inside], watched: 
     assert watched == []
 
 
-def test_poses_that_contradict_the_readings_are_told_of_after_the_answer(
+def test_contradictory_poses_are_reported_after_the_response(
     inside: Callable[..., Inside], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    asked: list[Any] = []
+    checked: list[Any] = []
     go_on = threading.Event()
 
     def contradiction(readings: Readings, extrinsics: Any, parameters: Any) -> list[str]:
-        asked.append((len(readings), dict(extrinsics)))
+        checked.append((len(readings), dict(extrinsics)))
         assert go_on.wait(60.0)
         return ['stamps are late']
 
@@ -109,16 +109,16 @@ def test_poses_that_contradict_the_readings_are_told_of_after_the_answer(
     node = robot.node
     robot.drive(0, 60)
     assert robot.call(node.em.run_em)[0]
-    robot.until(lambda: asked)
-    assert asked == [(len(node.associator.buffer), {'sonar': (0.1, 0.0, 0.4)})]
+    robot.until(lambda: checked)
+    assert checked == [(len(node.associator.buffer), {'sonar': (0.1, 0.0, 0.4)})]
     assert 'stamps are late' not in node.em.wrong_input
     go_on.set()
     robot.until(lambda: 'stamps are late' in node.em.wrong_input)
     assert 'stamps are late' in str(robot.status('readings'))
-    # what is found of maps that were forgotten is forgotten
+    # results for deleted maps are dropped
     go_on.clear()
     assert robot.call(node.em.run_em)[0]
-    robot.until(lambda: len(asked) == 2)
+    robot.until(lambda: len(checked) == 2)
     robot.call(node.reset)
     go_on.set()
     robot.until(lambda: not node.em.worker.worker.waiting)
@@ -126,7 +126,7 @@ def test_poses_that_contradict_the_readings_are_told_of_after_the_answer(
     assert node.em.wrong_input == []
 
 
-def test_em_maps_what_comes_while_its_kernels_are_compiled(
+def test_em_maps_readings_received_during_compilation(
     inside: Callable[..., Inside], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     robot = inside().start()
@@ -145,7 +145,7 @@ def test_em_maps_what_comes_while_its_kernels_are_compiled(
     assert node.em.explained == 50
 
 
-def test_em_that_cannot_have_what_came_meanwhile_says_so(
+def test_em_fails_if_newer_readings_do_not_fit_into_memory(
     inside: Callable[..., Inside], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     robot = inside().start()
@@ -164,25 +164,25 @@ def test_em_that_cannot_have_what_came_meanwhile_says_so(
     assert not success and 'does not fit into the memory' in message
 
 
-def test_a_call_that_fails_after_the_start_does_not_hold_up_the_others(inside: Callable[..., Inside]) -> None:
+def test_call_that_fails_after_the_start_does_not_block_others(inside: Callable[..., Inside]) -> None:
     robot = inside()
     robot.node.start()
-    told: list[Any] = []
+    responses: list[Any] = []
 
     def fail(reply: Any) -> None:
         raise KeyError('odd')
 
-    reply = SimpleNamespace(fail=told.append, send=lambda *fields: told.append(fields[0]))
+    reply = SimpleNamespace(fail=responses.append, send=lambda *fields: responses.append(fields[0]))
     for handler in (fail, robot.node.reset):
         robot.node._answer_when_ready(handler, reply)
-    robot.until(lambda: len(told) == 2)
-    assert told == ["it failed: KeyError('odd')", True]
+    robot.until(lambda: len(responses) == 2)
+    assert responses == ["it failed: KeyError('odd')", True]
 
 
-def test_commands_do_not_wait_for_the_online_map(
+def test_services_do_not_wait_for_the_online_map(
     inside: Callable[..., Inside], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """It is in the midst of readings that take for ever."""
+    """The online map is busy with readings for very long."""
     busy, go_on = threading.Event(), threading.Event()
     add = OnlineMap.add
 
@@ -207,7 +207,7 @@ def test_commands_do_not_wait_for_the_online_map(
     robot.until(lambda: node.maps.latest['ml_map'].info.width > 1)
 
 
-def test_messages_that_waited_are_taken_in_portions(inside: Callable[..., Inside]) -> None:
+def test_waiting_messages_are_processed_in_portions(inside: Callable[..., Inside]) -> None:
     robot = inside().start()
     node = robot.node
     for k in range(3000):
@@ -227,7 +227,7 @@ def test_messages_that_waited_are_taken_in_portions(inside: Callable[..., Inside
     assert len(node.associator.buffer) == 1001
 
 
-def test_what_comes_while_the_journal_is_read_waits(inside: Callable[..., Inside]) -> None:
+def test_messages_received_while_the_journal_is_read_wait(inside: Callable[..., Inside]) -> None:
     robot = inside()
     robot.node.start()
     assert not robot.node.mapping
@@ -240,12 +240,12 @@ def test_what_comes_while_the_journal_is_read_waits(inside: Callable[..., Inside
     for handler in (robot.node.em.run_em, robot.node.saver.save_maps):
         robot.node._answer_when_ready(handler, SimpleNamespace(send=lambda *fields: early.append(fields)))
     robot.until(lambda: len(robot.node.associator.buffer) == 50)
-    # the first runs EM, the second waits for its maps
+    # the first call runs EM, the second one waits for its maps
     robot.until(lambda: len(early) == 2)
     assert all(fields[0] for fields in early)
 
 
-def test_lost_messages_are_counted_and_warned_of(inside: Callable[..., Inside], tmp_path: Path) -> None:
+def test_lost_messages_are_counted_and_reported(inside: Callable[..., Inside], tmp_path: Path) -> None:
     robot = inside(range_reliability='reliable').start()
     robot.drive(0, 50)
     assert robot.status('readings')['level'] == OK
@@ -269,7 +269,7 @@ def test_lost_messages_are_counted_and_warned_of(inside: Callable[..., Inside], 
     assert robot.status('readings')['readings lost in the middleware (estimated)'] == '0'
 
 
-def test_parameters_of_the_association_work_at_run_time(inside: Callable[..., Inside]) -> None:
+def test_parameters_of_the_association_change_at_run_time(inside: Callable[..., Inside]) -> None:
     robot = inside().start()
     node = robot.node
     robot.set(pose_timeout=7.0, sigma=0.5, max_jump=3.0)
@@ -286,7 +286,7 @@ def test_parameters_of_the_association_work_at_run_time(inside: Callable[..., In
     assert node.associator.rejected['far_from_map'] == 1
 
 
-def test_a_faster_publish_rate_is_heeded_at_once(inside: Callable[..., Inside]) -> None:
+def test_higher_publish_rate_is_used_at_once(inside: Callable[..., Inside]) -> None:
     robot = inside(publish_rate=0.01).start()
     robot.drive(0, 20)
     assert robot.node.maps.latest['live_map'].info.width == 0
@@ -294,7 +294,7 @@ def test_a_faster_publish_rate_is_heeded_at_once(inside: Callable[..., Inside]) 
     robot.until(lambda: robot.node.maps.latest['live_map'].info.width, 20.0)
 
 
-def test_a_tenth_of_max_readings_before_it_there_is_a_warning(inside: Callable[..., Inside]) -> None:
+def test_warning_at_nine_tenths_of_max_readings(inside: Callable[..., Inside]) -> None:
     robot = inside(max_readings=100).start()
     robot.drive(0, 89)
     assert robot.status('readings')['level'] == OK
@@ -309,7 +309,7 @@ def test_a_tenth_of_max_readings_before_it_there_is_a_warning(inside: Callable[.
     assert robot.status('readings')['readings kept to map from'] == '100 of at most 100'
 
 
-def test_the_share_of_rejected_readings_shows_with_its_reason(inside: Callable[..., Inside]) -> None:
+def test_share_of_rejected_readings_is_reported_with_reason(inside: Callable[..., Inside]) -> None:
     robot = inside().start()
     robot.drive(0, 20)
     robot.status('readings')
@@ -323,7 +323,7 @@ def test_the_share_of_rejected_readings_shows_with_its_reason(inside: Callable[.
     assert robot.status('readings')['level'] == OK
 
 
-def test_the_report_warns_where_many_readings_were_rejected(inside: Callable[..., Inside]) -> None:
+def test_report_warns_of_many_rejected_readings(inside: Callable[..., Inside]) -> None:
     robot = inside().start()
     robot.drive(0, 20)
     for k in range(10):
@@ -333,20 +333,20 @@ def test_the_report_warns_where_many_readings_were_rejected(inside: Callable[...
     assert any(each.startswith('10 of 30 readings were rejected as below_min_range') for each in warnings)
 
 
-def test_a_sensor_whose_readings_are_rejected_is_named_though_they_are_few(inside: Callable[..., Inside]) -> None:
+def test_sensor_with_nearly_all_readings_rejected_is_named(inside: Callable[..., Inside]) -> None:
     robot = inside().start()
     robot.drive(0, 300)
     for k in range(40):
         robot.range(100.0 + 0.05 * k, value=0.0, frame='left')
-    told = 'nearly all readings of left were rejected as below_min_range: '
-    assert told in robot.status('readings')['message']
+    warning = 'nearly all readings of left were rejected as below_min_range: '
+    assert warning in robot.status('readings')['message']
     saved = robot.call(robot.node.saver.save_maps)[1]
     warnings = json.loads((Path(saved.split(', ')[0]).parent / 'report.json').read_text())['warnings']
-    assert any(each.startswith(told) for each in warnings)
+    assert any(each.startswith(warning) for each in warnings)
 
 
 class Gate:
-    """Holds up a function until it is opened."""
+    """Blocks a function until it is opened."""
 
     def __init__(self, monkeypatch: pytest.MonkeyPatch, owner: Any, name: str) -> None:
         self.reached, self.open = threading.Event(), threading.Event()
@@ -368,7 +368,9 @@ class Gate:
                 self.inside -= 1
 
 
-def test_two_saves_are_made_one_after_the_other(inside: Callable[..., Inside], monkeypatch: pytest.MonkeyPatch) -> None:
+def test_two_calls_of_save_maps_are_done_one_after_the_other(
+    inside: Callable[..., Inside], monkeypatch: pytest.MonkeyPatch
+) -> None:
     robot = inside().start()
     robot.drive(0, 20)
     assert robot.call(robot.node.em.run_em)[0]
@@ -386,10 +388,10 @@ def test_two_saves_are_made_one_after_the_other(inside: Callable[..., Inside], m
     assert len(folders) == 3
 
 
-def test_maps_of_a_run_before_the_reset_never_come(
+def test_maps_of_a_run_before_a_reset_are_never_published(
     inside: Callable[..., Inside], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The run has found its maps when reset is called, and cannot be cancelled any more."""
+    """The search is done when reset is called, and can no longer be cancelled."""
     robot = inside(publish_rate=50.0).start()
     node = robot.node
     robot.drive(0, 20)
@@ -419,7 +421,7 @@ def test_maps_of_a_run_before_the_reset_never_come(
     assert robot.status('EM')['last run'] == 'EM was cancelled by reset'
 
 
-def test_a_late_map_of_an_earlier_generation_is_dropped(inside: Callable[..., Inside]) -> None:
+def test_late_map_from_before_a_reset_is_dropped(inside: Callable[..., Inside]) -> None:
     robot = inside().start()
     node = robot.node
     robot.drive(0, 5)
@@ -431,7 +433,7 @@ def test_a_late_map_of_an_earlier_generation_is_dropped(inside: Callable[..., In
     assert [message.info.width for message in node.maps.latest.values()] == [1, 1, 1]
 
 
-def test_the_journal_is_closed_in_order(inside: Callable[..., Inside], tmp_path: Path) -> None:
+def test_journal_is_closed_normally(inside: Callable[..., Inside], tmp_path: Path) -> None:
     folder = tmp_path / 'journal'
     robot = inside(journal=str(folder)).start()
     robot.drive(0, 30)
@@ -443,7 +445,7 @@ def test_the_journal_is_closed_in_order(inside: Callable[..., Inside], tmp_path:
     assert len(again.node.associator.buffer) == 30
 
 
-def test_a_worker_that_fails_shows_in_diagnostics_and_maps_go_on(
+def test_failing_worker_is_in_the_diagnostics_and_mapping_continues(
     inside: Callable[..., Inside], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     robot = inside(online=True).start()
@@ -466,7 +468,7 @@ def test_a_worker_that_fails_shows_in_diagnostics_and_maps_go_on(
     assert robot.status('background')['level'] == OK
 
 
-def test_thinning_without_memory_is_tried_again(inside: Callable[..., Inside], monkeypatch: pytest.MonkeyPatch) -> None:
+def test_thinning_without_memory_is_retried(inside: Callable[..., Inside], monkeypatch: pytest.MonkeyPatch) -> None:
     robot = inside(max_readings=80).start()
     original = reading_buffer.kept
 
@@ -484,7 +486,7 @@ def test_thinning_without_memory_is_tried_again(inside: Callable[..., Inside], m
     assert robot.status('background')['level'] == OK
 
 
-def test_a_callback_that_fails_is_logged_and_the_node_goes_on() -> None:
+def test_failing_callback_is_logged_and_the_node_continues() -> None:
     logged: list[str] = []
     turns = iter([ValueError('odd'), KeyError('odd too'), main._Stop()])
 
@@ -501,8 +503,8 @@ def test_a_callback_that_fails_is_logged_and_the_node_goes_on() -> None:
     assert 'ValueError: odd' in logged[0] and 'mapping continues' in logged[0]
 
 
-def test_the_buffer_of_the_node_is_thinned_aside(inside: Callable[..., Inside]) -> None:
-    """And the live map has what goes."""
+def test_buffer_of_the_node_is_thinned_in_the_background(inside: Callable[..., Inside]) -> None:
+    """The live map still contains all readings."""
     robot = inside(max_readings=100).start()
     node = robot.node
     assert isinstance(node.associator.buffer, ReadingBuffer) and node.associator.buffer.aside is not None

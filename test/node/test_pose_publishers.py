@@ -1,4 +1,4 @@
-"""The transform from the map to odometry, and the path, as others get them."""
+"""The published transform from map to odom, and the published path."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ OK, WARN = b'\x00', b'\x01'
 
 
 class Broadcaster:
-    """Stands in for `tf2_ros.TransformBroadcaster`."""
+    """Stand-in for `tf2_ros.TransformBroadcaster`."""
 
     sent: list[Any]
 
@@ -48,7 +48,7 @@ def stand_in(monkeypatch: pytest.MonkeyPatch, module: str, **names: Any) -> None
 
 @pytest.fixture
 def tf2_ros(monkeypatch: pytest.MonkeyPatch) -> type[Broadcaster]:
-    """What of tf2_ros the node uses; its buffer knows nothing."""
+    """Stand-in for the parts of tf2_ros that the node uses; its buffer has no transforms."""
 
     class Buffer:
         def clear(self) -> None:
@@ -64,7 +64,7 @@ def tf2_ros(monkeypatch: pytest.MonkeyPatch) -> type[Broadcaster]:
         def __init__(self, buffer: Any, node: Any, *, spin_thread: bool = False) -> None:
             pass
 
-    # a type of message that rclpy knows, with a field `transforms`, as TFMessage has it
+    # a message type that rclpy knows, with a field `transforms` as in TFMessage
     stand_in(monkeypatch, 'tf2_msgs')
     stand_in(monkeypatch, 'tf2_msgs.msg', TFMessage=MultiDOFJointState)
     stand_in(
@@ -88,7 +88,7 @@ def seconds_of(transform: Any) -> float:
     return float(stamp.sec + 1e-9 * stamp.nanosec)
 
 
-def test_the_transform_from_map_to_odom_is_sent(
+def test_transform_from_map_to_odom_is_published(
     inside: Callable[..., Inside], quick: Any, tf2_ros: type[Broadcaster], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(pose_publishers, 'REPEAT', math.inf)
@@ -108,7 +108,7 @@ def test_the_transform_from_map_to_odom_is_sent(
     bent = odometry_of(robot)
     robot.until(lambda: len(tf2_ros.sent) > count)
     x, y, yaw = numbers(tf2_ros.sent[-1])
-    # odometry had ended: the stamp is a later one all the same
+    # odometry had ended: the stamp is still a later one
     assert tf2_ros.sent[-1].header.stamp.nanosec == first.header.stamp.nanosec + 1
     was, now = bent.pose[-1], bend(bent).pose[-1]
     assert compose(np.array([x, y, yaw]), was) == pytest.approx(now)
@@ -121,7 +121,7 @@ def test_the_transform_from_map_to_odom_is_sent(
 
 
 def mapping(inside: Callable[..., Inside], monkeypatch: pytest.MonkeyPatch) -> tuple[Inside, list[float]]:
-    """A node that maps, and the time of the machine, which goes on where it is told to."""
+    """A node that maps, and the clock of the machine, set by the test."""
     clock = [1000.0]
     monkeypatch.setattr(pose_publishers.time, 'monotonic', lambda: clock[0])
     robot = inside(refine_poses=True)
@@ -130,10 +130,10 @@ def mapping(inside: Callable[..., Inside], monkeypatch: pytest.MonkeyPatch) -> t
     return robot, clock
 
 
-def test_while_odometry_is_silent_the_transform_is_repeated(
+def test_transform_is_repeated_without_new_odometry(
     inside: Callable[..., Inside], tf2_ros: type[Broadcaster], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """For those who start later; of another stamp, since TF warns of the same, and of no later time."""
+    """For late subscribers; each has another stamp, since TF warns of equal ones, but not a later time."""
     robot, clock = mapping(inside, monkeypatch)
     robot.odometry(100.0)
     tick, sent = robot.node.trajectory._tick, tf2_ros.sent
@@ -145,7 +145,7 @@ def test_while_odometry_is_silent_the_transform_is_repeated(
     stamps = [transform.header.stamp.sec * 10**9 + transform.header.stamp.nanosec for transform in sent]
     assert stamps == [100_200_000_000 + k for k in range(4)]
     assert all(numbers(transform) == (0.0, 0.0, 0.0) for transform in sent)
-    # an inactive node leaves the frame to others, but for what is new
+    # an inactive node repeats nothing, and publishes only new transforms
     robot.node.deactivate()
     tick()
     assert len(sent) == 4
@@ -154,7 +154,7 @@ def test_while_odometry_is_silent_the_transform_is_repeated(
     assert seconds_of(sent[-1]) == pytest.approx(100.3) and len(sent) == 5
 
 
-def test_one_stamp_from_the_future_does_not_go_to_tf(
+def test_one_stamp_from_the_future_is_not_published_to_tf(
     inside: Callable[..., Inside], tf2_ros: type[Broadcaster], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     robot, clock = mapping(inside, monkeypatch)
@@ -169,7 +169,7 @@ def test_one_stamp_from_the_future_does_not_go_to_tf(
     assert robot.node.trajectory.driven == pytest.approx(4.95)
     robot.until(lambda: path and len(path[-1].stamp) > 90)
     assert path[-1].stamp[0] == 100 * 10**9 and len(path[-1].stamp) < 100
-    # where it lasts, it counts; and is taken back if it was wrong all the same
+    # if it lasts, it is used, and taken back if it was wrong
     robot.odometry(1000.0, 5.0)
     tick()
     assert seconds_of(sent[-1]) < 111.0
@@ -181,10 +181,10 @@ def test_one_stamp_from_the_future_does_not_go_to_tf(
     assert seconds_of(sent[-1]) == pytest.approx(110.2)
 
 
-def test_after_the_clock_jumped_back_the_transform_is_that_of_readings_of_its_stamp(
+def test_transform_after_a_jump_back_is_that_of_its_stamp(
     inside: Callable[..., Inside], quick: Any, tf2_ros: type[Broadcaster]
 ) -> None:
-    """A bag that is played again and again, or a simulation that begins anew."""
+    """For example a looped bag, or a restarted simulation."""
     robot = inside(refine_poses=True).start()
     robot.drive(0, 200)
     assert robot.call(robot.node.em.run_em)[0]
@@ -198,12 +198,12 @@ def test_after_the_clock_jumped_back_the_transform_is_that_of_readings_of_its_st
             each.at(np.array([round(of * 1e9)]))[0] for each in (correction.odometry, correction.trajectory)
         )
         x, y, yaw = numbers(tf2_ros.sent[-1])
-        # between two poses both are interpolated
+        # between two poses, both are interpolated
         assert compose(np.array([x, y, yaw]), odometry) == pytest.approx(path, abs=0.01)
     assert robot.node.associator.time_jumps == 1
 
 
-def test_the_path_begins_with_the_drive_also_where_the_clock_jumps_back_after_it(
+def test_path_begins_with_the_drive_after_a_jump_back(
     inside: Callable[..., Inside], quick: Any, tf2_ros: type[Broadcaster], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     robot = inside(refine_poses=True).start()
@@ -216,7 +216,7 @@ def test_the_path_begins_with_the_drive_also_where_the_clock_jumps_back_after_it
         robot.node.trajectory._tick()
     robot.until(lambda: shown and len(shown[-1].stamp))
     assert shown[-1].stamp[0] == 20 * 10**9
-    # a reset, after which nothing jumps, begins another drive
+    # a reset without a later jump begins another drive
     robot.call(robot.node.reset)
     for k in range(20, 40):
         robot.odometry(20.0 + 0.1 * k, 0.1 * k)
@@ -225,7 +225,9 @@ def test_the_path_begins_with_the_drive_also_where_the_clock_jumps_back_after_it
     assert shown[-1].stamp[0] == 22 * 10**9
 
 
-def test_without_refine_poses_nothing_is_sent(inside: Callable[..., Inside], tf2_ros: type[Broadcaster]) -> None:
+def test_without_refine_poses_no_transform_is_published(
+    inside: Callable[..., Inside], tf2_ros: type[Broadcaster]
+) -> None:
     tf2_ros.sent = []
     robot = inside().start()
     robot.drive(0, 20)
@@ -235,7 +237,7 @@ def test_without_refine_poses_nothing_is_sent(inside: Callable[..., Inside], tf2
     assert not names & {'/tf', '/forward_grid_mapper/path', '/forward_grid_mapper/pose'}
 
 
-def test_with_tf2_msgs_alone_it_goes_there_as_a_message(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_transform_is_published_with_tf2_msgs_only(monkeypatch: pytest.MonkeyPatch) -> None:
     class TFMessage:
         def __init__(self, transforms: list[Any]) -> None:
             self.transforms = transforms
@@ -259,9 +261,7 @@ def test_with_tf2_msgs_alone_it_goes_there_as_a_message(monkeypatch: pytest.Monk
     assert sent[0].transforms == ['a transform']
 
 
-def test_the_latest_stamp_that_a_message_has_room_for_is_sent(
-    inside: Callable[..., Inside], tf2_ros: type[Broadcaster]
-) -> None:
+def test_latest_possible_stamp_is_published(inside: Callable[..., Inside], tf2_ros: type[Broadcaster]) -> None:
     publishers = pose_publishers.PosePublishers(inside().node)
     latest = (2**31 - 1) * NANOSECONDS + NANOSECONDS - 1
     for _ in range(2):
@@ -271,7 +271,7 @@ def test_the_latest_stamp_that_a_message_has_room_for_is_sent(
     assert [(stamp.sec, stamp.nanosec) for stamp in stamps] == [divmod(latest, NANOSECONDS)] * 2
 
 
-def test_the_path_is_bounded_and_begins_and_ends_with_the_drive() -> None:
+def test_path_is_bounded_and_covers_the_drive() -> None:
     from builtin_interfaces.msg import Time
 
     from forward_grid_mapper.node.pose_publishers import MOST_POINTS, path_message

@@ -1,4 +1,4 @@
-"""The node that refines by itself while it drives, and the path that grows."""
+"""Automatic refinement while the robot drives (`refine_every`), and the growing path."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from forward_grid_mapper.node import trajectory
 OK, WARN = b'\x00', b'\x01'
 
 
-def test_it_refines_by_itself_after_some_way(
+def test_node_refines_after_the_distance_of_refine_every(
     inside: Callable[..., Inside], quick: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(trajectory, 'LEAST_EVERY', 0.1)
@@ -41,12 +41,12 @@ def test_it_refines_by_itself_after_some_way(
     assert node.em.maps is first and node.em.current is None
     robot.drive(160, 120)
     robot.until(lambda: node.em.maps is not first and node.em.current is None)
-    # a service call begins the way anew
+    # a service call restarts the distance
     assert robot.call(node.em.run_em)[0]
     assert node.trajectory.driven - node.trajectory._refined_at < 0.05
 
 
-def test_it_refines_soon_after_a_jump(
+def test_node_refines_soon_after_a_jump(
     inside: Callable[..., Inside], quick: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(trajectory, 'AFTER_JUMP', 0.1)
@@ -66,7 +66,7 @@ def test_it_refines_soon_after_a_jump(
     assert node.em.maps is first and node.em.current is None, 'once is enough'
 
 
-def test_it_does_not_refine_at_every_step(inside: Callable[..., Inside], quick: Any) -> None:
+def test_node_does_not_refine_at_each_step(inside: Callable[..., Inside], quick: Any) -> None:
     robot = inside(refine_poses=True, refine_every=1e-9).start()
     begin(robot)
     robot.drive(1, 100)
@@ -75,7 +75,9 @@ def test_it_does_not_refine_at_every_step(inside: Callable[..., Inside], quick: 
 
 
 @pytest.mark.parametrize('options', [{}, {'refine_every': 0.05}])
-def test_without_being_told_it_does_not(inside: Callable[..., Inside], quick: Any, options: dict[str, Any]) -> None:
+def test_node_does_not_refine_without_refine_every(
+    inside: Callable[..., Inside], quick: Any, options: dict[str, Any]
+) -> None:
     robot = inside(refine_poses=not options, **options).start()
     if not options:
         begin(robot)
@@ -85,7 +87,7 @@ def test_without_being_told_it_does_not(inside: Callable[..., Inside], quick: An
     assert robot.node.em.current is None and robot.node.em.maps is None
 
 
-def test_the_path_grows_as_the_robot_drives(
+def test_path_grows_as_the_robot_drives(
     inside: Callable[..., Inside], quick: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(trajectory, 'PATH_EVERY', 0.02)

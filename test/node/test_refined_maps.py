@@ -1,4 +1,4 @@
-"""The node with `refine_poses` and `online` over DDS: what it finds as a whole is what the offline tool finds."""
+"""The node with `refine_poses` and `online` over DDS: refinement gives the result of the offline tool."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def folder_of(answer: Any) -> Path:
 
 
 @pytest.mark.slow
-def test_the_maps_of_a_bent_drive_are_those_of_the_offline_tool(
+def test_maps_of_a_drive_with_drift_equal_those_of_the_offline_tool(
     start: Callable[..., Any], robot: Any, tmp_path: Path
 ) -> None:
     recording = bent_drive()
@@ -53,7 +53,7 @@ def test_the_maps_of_a_bent_drive_are_those_of_the_offline_tool(
     robot.play(messages[:first], 1000.0)
     status = robot.until(lambda: robot.diagnostics.get('trajectory'))
     assert 'until run_em is called' in status['message']
-    # what is followed after an earlier run says nothing in the next
+    # following after an earlier run has no effect on the next run
     answer = robot.call('run_em', seconds=300.0)
     assert 'trajectory refined' in answer.message, answer.message
     robot.play(messages[first:], 1000.0)
@@ -80,7 +80,7 @@ def test_the_maps_of_a_bent_drive_are_those_of_the_offline_tool(
     assert reports[0]['input']['trajectory']['refined']
     assert (reports[0]['input']['odom_frame'], reports[0]['input']['map_frame']) == ('odom', 'map')
     assert {name: robot.maps[name][-1].header.frame_id for name in robot.maps} == dict.fromkeys(robot.maps, 'map')
-    # whoever comes late gets the path, and without TF the pose
+    # late subscribers get the path, and the pose if there is no TF
     paths: list[PathMessage] = []
     poses: list[PoseWithCovarianceStamped] = []
     robot.node.create_subscription(PathMessage, f'{robot.name}/path', paths.append, LATCHED)

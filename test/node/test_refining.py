@@ -1,4 +1,4 @@
-"""The node with `refine_poses`, with a quick refiner: who is moved when a trajectory was found, or not."""
+"""The node with `refine_poses` and a quick refiner: what is moved after a trajectory is accepted or rejected."""
 
 from __future__ import annotations
 
@@ -26,15 +26,15 @@ from forward_grid_mapper.node import refining
 OK, WARN = b'\x00', b'\x01'
 
 
-def test_the_live_map_and_what_comes_later_are_moved(inside: Callable[..., Inside], quick: Any) -> None:
+def test_live_map_and_later_readings_are_moved(inside: Callable[..., Inside], quick: Any) -> None:
     robot, bent = refined(inside(refine_poses=True).start())
     assert robot.node.trajectory.correction.moved > 0.9
     assert_live(robot, bent)
     robot.drive(200, 50)
     assert_live(robot, bent)
-    # the journal and the buffer keep what odometry said
+    # the journal and the buffer keep the poses of odometry
     assert robot.node.associator.readings.x[-1] == pytest.approx(0.1 + 0.001 * 249)
-    # the next run looks at all of it anew
+    # the next run uses all of it again
     assert robot.call(robot.node.em.run_em)[0]
     assert_live(robot, odometry_of(robot))
 
@@ -57,7 +57,7 @@ def test_values_of_the_wheels_that_nobody_tested_are_no_result(
     )
 
 
-def test_readings_that_come_while_it_runs_are_not_lost(
+def test_readings_received_during_refinement_are_not_lost(
     inside: Callable[..., Inside], quick: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     robot = inside(refine_poses=True).start()
@@ -73,7 +73,7 @@ def test_readings_that_come_while_it_runs_are_not_lost(
     assert_live(robot, bent)
 
 
-def test_a_refusal_leaves_everything_as_odometry_has_it(inside: Callable[..., Inside], quick: Any) -> None:
+def test_rejected_trajectory_keeps_the_poses_of_odometry(inside: Callable[..., Inside], quick: Any) -> None:
     plain = inside().start()
     plain.drive(0, 150)
     assert plain.call(plain.node.em.run_em)[0]
@@ -89,7 +89,7 @@ def test_a_refusal_leaves_everything_as_odometry_has_it(inside: Callable[..., In
     assert 'rajectory' not in plain.node.em.last_run
 
 
-def test_a_refusal_after_a_trajectory_keeps_it(inside: Callable[..., Inside], quick: Any) -> None:
+def test_rejected_trajectory_keeps_the_earlier_one(inside: Callable[..., Inside], quick: Any) -> None:
     robot, bent = refined(inside(refine_poses=True).start())
     quick.accepts = False
     for first in (200, 220):
@@ -103,14 +103,14 @@ def test_a_refusal_after_a_trajectory_keeps_it(inside: Callable[..., Inside], qu
     assert 'kept' in status['message'] and 'the test says so' in status['message']
     assert status['places recognised'] == '3', 'of the run that found it'
     assert robot.call(robot.node.saver.save_maps)[0]
-    # what a run finds by itself takes its place
+    # the trajectory of a later run replaces it
     quick.accepts = True
     assert robot.call(robot.node.em.run_em)[0]
     assert 'kept' not in robot.node.em.last_run
     assert_live(robot, odometry_of(robot))
 
 
-def test_it_goes_back_to_odometry_where_this_is_better(
+def test_node_returns_to_odometry_if_it_is_better(
     inside: Callable[..., Inside], quick: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     robot, _ = refined(inside(refine_poses=True).start())
@@ -126,9 +126,7 @@ def test_it_goes_back_to_odometry_where_this_is_better(
     )
 
 
-def test_a_jump_of_odometry_is_warned_of_until_a_run_has_looked_at_it(
-    inside: Callable[..., Inside], quick: Any
-) -> None:
+def test_jump_of_odometry_gives_a_warning_until_the_next_run(inside: Callable[..., Inside], quick: Any) -> None:
     robot, _ = refined(inside(refine_poses=True).start())
     node = robot.node
     robot.until(lambda: node.trajectory._at is not None)
@@ -150,10 +148,10 @@ def test_a_jump_of_odometry_is_warned_of_until_a_run_has_looked_at_it(
     assert robot.status('trajectory')['level'] == OK
 
 
-def test_whether_odometry_with_few_messages_jumped_is_told_by_the_last_minute(inside: Callable[..., Inside]) -> None:
+def test_jump_with_rare_odometry_is_detected_by_the_last_minute(inside: Callable[..., Inside]) -> None:
     robot = inside(refine_poses=True).start()
     trajectory, x = robot.node.trajectory, 0.0
-    # a robot that does 0.6 m/s, and now and then 1.2 m/s
+    # a robot that drives at 0.6 m/s, and sometimes at 1.2 m/s
     for k in range(40):
         x += 0.54 if k % 8 else 1.08
         robot.odometry(100.0 + 0.9 * k, x)
@@ -166,14 +164,14 @@ def test_whether_odometry_with_few_messages_jumped_is_told_by_the_last_minute(in
         robot.until(lambda x=x: trajectory._at[1].x == x)
     assert 'odometry jumped by 2.5 m' in robot.status('trajectory')['message']
     assert trajectory.driven == pytest.approx(driven + 0.54), 'nobody drove that, and the way before counts once'
-    # as a run does that has looked at it
+    # as after a run that has examined it
     trajectory._jump = None
     robot.odometry(100.0 + 0.9 * 42, x + 0.54)
     robot.until(lambda: trajectory._at[1].x == x + 0.54)
     assert trajectory._jump is None and trajectory.driven == pytest.approx(driven + 1.08)
 
 
-def test_what_a_run_could_not_place_is_warned_of(
+def test_part_that_could_not_be_placed_gives_a_warning(
     inside: Callable[..., Inside], quick: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     run = quick.run
@@ -190,7 +188,7 @@ def test_what_a_run_could_not_place_is_warned_of(
     assert 'odometry jumps, and it is not known' in (saved / 'report.txt').read_text().replace('\n', ' ')
 
 
-def test_it_can_be_switched_on_and_off_between_runs(inside: Callable[..., Inside], quick: Any) -> None:
+def test_refine_poses_can_be_changed_between_runs(inside: Callable[..., Inside], quick: Any) -> None:
     robot, bent = refined(inside().start())
     node = robot.node
     assert node.trajectory.frame == 'odom'
@@ -213,7 +211,7 @@ def published(robot: Inside) -> dict[str, Any]:
     return robot.node.maps.latest
 
 
-def test_reset_forgets_the_trajectory(inside: Callable[..., Inside], quick: Any) -> None:
+def test_reset_deletes_the_trajectory(inside: Callable[..., Inside], quick: Any) -> None:
     robot, _ = refined(inside(refine_poses=True).start())
     robot.call(robot.node.reset)
     assert robot.node.trajectory.correction is None
@@ -222,12 +220,12 @@ def test_reset_forgets_the_trajectory(inside: Callable[..., Inside], quick: Any)
     robot.drive(200, 30)
     assert_live(robot, None)
     assert 'until run_em' in robot.status('trajectory')['message']
-    # the drive is the one that began with the reset
+    # the drive is the one since the reset
     assert len(odometry_of(robot).stamp) <= 32
     assert robot.node.associator.record.newest is not None
 
 
-def test_reset_and_cancelling_end_a_refinement(inside: Callable[..., Inside], monkeypatch: pytest.MonkeyPatch) -> None:
+def test_reset_and_cancel_end_a_refinement(inside: Callable[..., Inside], monkeypatch: pytest.MonkeyPatch) -> None:
     begun, cancelled = threading.Event(), threading.Event()
 
     class Slow(QuickRefiner):
@@ -278,7 +276,7 @@ def test_progress_of_the_refinement_is_in_the_diagnostics(
     robot.until(lambda: answer.sent)
 
 
-def test_the_online_map_goes_along(inside: Callable[..., Inside], quick: Any) -> None:
+def test_online_map_moves_with_the_trajectory(inside: Callable[..., Inside], quick: Any) -> None:
     robot, _ = refined(inside(refine_poses=True, online=True, publish_rate=50.0).start())
     node = robot.node
     robot.drive(200, 30)
@@ -289,7 +287,7 @@ def test_the_online_map_goes_along(inside: Callable[..., Inside], quick: Any) ->
     assert not node.online.worker.trouble
 
 
-def test_after_a_restart_the_journal_tells_the_odometry(
+def test_odometry_is_recovered_from_the_journal_after_a_restart(
     inside: Callable[..., Inside], quick: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     options = {'refine_poses': True, 'journal': str(tmp_path / 'journal')}
@@ -318,7 +316,7 @@ def test_after_a_restart_the_journal_tells_the_odometry(
     assert_live(robot, seen[-1])
 
 
-def test_odometry_in_frame_map_is_left_alone_in_words(inside: Callable[..., Inside], quick: Any) -> None:
+def test_odometry_in_frame_map_is_not_refined_with_reason(inside: Callable[..., Inside], quick: Any) -> None:
     robot = inside(refine_poses=True, map_frame='odom').start()
     robot.drive(0, 60)
     assert robot.call(robot.node.em.run_em)[0]
@@ -330,7 +328,7 @@ def test_odometry_in_frame_map_is_left_alone_in_words(inside: Callable[..., Insi
     assert 'REP 105' in status['message']
 
 
-def test_who_gives_the_transform_does_not_change_while_the_node_runs(inside: Callable[..., Inside]) -> None:
+def test_refine_poses_cannot_change_the_source_of_the_transform(inside: Callable[..., Inside]) -> None:
     robot = inside(refine_poses=True, map_frame='building').start()
     robot.drive(0, 10)
     assert robot.node.trajectory.frame == 'building'

@@ -1,4 +1,4 @@
-"""What the node says of its input: causes in words, and nothing of what a reset has forgotten."""
+"""Diagnostics about the input: causes in words, and no faults from before a reset."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ OK, WARN = b'\x00', b'\x01'
 
 
 def judged(robot: Taking, health: Health) -> tuple[bytes, str]:
-    """Level and message of the readings, once a second of the test has passed."""
+    """Level and message of the readings, after another second of the test."""
     if not robot.intake.listening:
         robot.intake.subscribe()
     found = health.statuses('mapper', robot.intake, robot.associator, None, 'none yet', Grid(0.1, 0, 0, 1, 1), {})[0]
@@ -33,13 +33,13 @@ def judged(robot: Taking, health: Health) -> tuple[bytes, str]:
 
 
 def drive(robot: Taking, first: int, good: int, bad: int, frame: str = '') -> None:
-    """Readings with and without a frame, and odometry with each."""
+    """Readings with and without a frame, each with odometry."""
     for k in range(first, first + good + bad):
         robot.odometry(100.0 + 0.05 * k)
         robot.range(100.0 + 0.05 * k, 'sonar' if k < first + good else frame)
 
 
-def test_the_reason_is_that_of_the_last_second_also_after_a_reset() -> None:
+def test_reason_is_that_of_the_last_second_also_after_a_reset() -> None:
     robot, health = Taking(), Health()
     robot.intake.begin()
     drive(robot, 0, 10, 90)
@@ -53,14 +53,14 @@ def test_the_reason_is_that_of_the_last_second_also_after_a_reset() -> None:
     robot.associator.clear()
     robot.intake.forget()
     judged(robot, health)
-    # fewer than before the reset
+    # fewer readings than before the reset
     drive(robot, 205, 10, 40)
     drive(robot, 255, 0, 15, 'x' * 1000)
     level, message = judged(robot, health)
     assert level == WARN and '55 of 65' in message and 'most of them as empty_frame_id' in message
 
 
-def test_a_middleware_that_states_no_times_delays_nothing() -> None:
+def test_delay_is_zero_without_times_of_the_middleware() -> None:
     robot, health = Taking(), Health()
     robot.intake.subscribe()
 
@@ -74,7 +74,7 @@ def test_a_middleware_that_states_no_times_delays_nothing() -> None:
     assert 2000 <= float(delay()) < 10_000
 
 
-def test_a_stamp_of_odometry_that_stands_still_is_told_of(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_constant_stamp_of_odometry_gives_a_warning(monkeypatch: pytest.MonkeyPatch) -> None:
     robot, now = Taking(), 50.0
     monkeypatch.setattr(diagnostics.time, 'monotonic', lambda: now)
     health = Health()
@@ -87,11 +87,11 @@ def test_a_stamp_of_odometry_that_stands_still_is_told_of(monkeypatch: pytest.Mo
         robot.range(1000.0 + k)
         return judged(robot, health)
 
-    told = [second(k, 0.0) for k in range(5)]
-    assert 'its stamp has been 0.000 s for 5 s' in told[-1][1] and told[-1][0] == WARN
-    assert 'header.stamp' not in told[1][1]
+    verdicts = [second(k, 0.0) for k in range(5)]
+    assert 'its stamp has been 0.000 s for 5 s' in verdicts[-1][1] and verdicts[-1][0] == WARN
+    assert 'header.stamp' not in verdicts[1][1]
     assert all('header.stamp' not in second(k, 1000.0 + k)[1] for k in range(5, 12))
-    # without readings that wait for it, such as a robot that only listens, it does not matter
+    # without waiting readings, as of a robot without sonars, it does not matter
     quiet, health = Taking(), Health()
     quiet.intake.begin()
     for _ in range(6):
@@ -101,7 +101,7 @@ def test_a_stamp_of_odometry_that_stands_still_is_told_of(monkeypatch: pytest.Mo
 
 
 def seconds(robot: Taking, clock: Any, health: Health, count: int, every: int, frame: str) -> list[tuple[bytes, str]]:
-    """Verdicts of so many seconds, in which a sensor sends every few seconds; odometry comes all the time."""
+    """Verdicts of `count` seconds with readings of a sensor every few seconds; odometry comes all the time."""
     found = []
     for k in range(count):
         clock.now += 1.0
@@ -113,33 +113,33 @@ def seconds(robot: Taking, clock: Any, health: Health, count: int, every: int, f
     return found
 
 
-def test_a_sensor_that_measures_rarely_has_one_verdict(clock: Any) -> None:
+def test_sensor_with_rare_readings_has_a_constant_verdict(clock: Any) -> None:
     robot, health = Taking(), Health()
     robot.intake.begin()
-    told = seconds(robot, clock, health, 20, 3, '')
-    assert {level for level, _ in told} == {WARN}
-    assert 'readings were rejected in the last 10 s, most of them as empty_frame_id' in told[-1][1]
-    # good ones show within some seconds
-    told = seconds(robot, clock, health, 24, 3, 'sonar')
-    assert told[-1] == (OK, 'mapping')
-    # a good sensor that sends fast does not hide the frame that nobody knows
+    verdicts = seconds(robot, clock, health, 20, 3, '')
+    assert {level for level, _ in verdicts} == {WARN}
+    assert 'readings were rejected in the last 10 s, most of them as empty_frame_id' in verdicts[-1][1]
+    # good readings change the verdict within some seconds
+    verdicts = seconds(robot, clock, health, 24, 3, 'sonar')
+    assert verdicts[-1] == (OK, 'mapping')
+    # a good sensor with a high rate does not hide the unknown frame
     robot.associator.rejected['unknown_extrinsics'] += 1
     robot.associator.unknown_frames.add('ghost')
-    told = seconds(robot, clock, health, 5, 1, 'sonar')
-    assert {text for _, text in told} == {'no pose on the robot for ghost'}
+    verdicts = seconds(robot, clock, health, 5, 1, 'sonar')
+    assert {text for _, text in verdicts} == {'no pose on the robot for ghost'}
 
 
-def test_a_sensor_that_sends_every_five_seconds_is_not_silent_in_between(clock: Any) -> None:
+def test_sensor_with_readings_every_five_seconds_is_not_silent(clock: Any) -> None:
     robot, health = Taking(), Health()
     robot.intake.begin()
     seconds(robot, clock, health, 10, 5, 'sonar')
-    told = seconds(robot, clock, health, 20, 5, 'sonar')
-    assert set(told) == {(OK, 'mapping')}
-    told = seconds(robot, clock, health, int(5 * USUAL) + 5, 1000, 'sonar')
-    assert told[-1][0] == WARN and told[-1][1].startswith('no Range for ')
+    verdicts = seconds(robot, clock, health, 20, 5, 'sonar')
+    assert set(verdicts) == {(OK, 'mapping')}
+    verdicts = seconds(robot, clock, health, int(5 * USUAL) + 5, 1000, 'sonar')
+    assert verdicts[-1][0] == WARN and verdicts[-1][1].startswith('no Range for ')
 
 
-def test_where_nothing_was_accepted_it_does_not_say_mapping(clock: Any) -> None:
+def test_status_without_accepted_readings_is_not_mapping(clock: Any) -> None:
     robot, health = Taking(), Health()
     robot.intake.begin()
     seconds(robot, clock, health, 5, 1, '')
@@ -156,7 +156,7 @@ def test_where_nothing_was_accepted_it_does_not_say_mapping(clock: Any) -> None:
     assert text.startswith('no reading has been accepted so far: 5 were rejected, most of them as empty_frame_id')
 
 
-def test_while_readings_wait_it_does_not_say_mapping_either(clock: Any) -> None:
+def test_status_with_waiting_readings_is_not_mapping(clock: Any) -> None:
     robot, health = Taking(), Health()
     robot.intake.begin()
     robot.odometry(100.0)
@@ -166,8 +166,8 @@ def test_while_readings_wait_it_does_not_say_mapping_either(clock: Any) -> None:
     assert judged(robot, health) == (OK, 'mapping')
 
 
-def test_more_rejected_than_came(clock: Any) -> None:
-    """Readings that came before, and waited."""
+def test_more_readings_rejected_than_received_in_a_second(clock: Any) -> None:
+    """They were received before, and waited."""
     robot, health = Taking(), Health()
     robot.intake.begin()
     robot.odometry(100.0)
@@ -181,7 +181,7 @@ def test_more_rejected_than_came(clock: Any) -> None:
     assert '32 of 32 readings were rejected in the last second' in judged(robot, health)[1]
 
 
-def test_what_was_rejected_during_a_pause_is_no_fault_after_it(clock: Any) -> None:
+def test_readings_rejected_in_a_pause_are_no_fault_afterwards(clock: Any) -> None:
     robot, health = Taking(), Health()
     robot.intake.begin()
     seconds(robot, clock, health, 5, 1, 'sonar')
@@ -191,7 +191,7 @@ def test_what_was_rejected_during_a_pause_is_no_fault_after_it(clock: Any) -> No
     assert seconds(robot, clock, health, 3, 1, 'sonar') == [(OK, 'mapping')] * 3
 
 
-def test_both_that_are_missing_are_told_and_where_they_come_from(clock: Any) -> None:
+def test_missing_ranges_and_odometry_are_both_reported(clock: Any) -> None:
     robot, health = Taking(), Health()
     robot.intake.subscribe()
     robot.intake.begin()
@@ -211,11 +211,11 @@ def test_both_that_are_missing_are_told_and_where_they_come_from(clock: Any) -> 
 
     assert verdict() == (OK, 'no reading has been accepted so far: none has been received')
     clock.now += 4.0
-    said = 'no odometry for 4 s: no node publishes Odometry; no Range for 4 s: no node publishes Range'
-    assert verdict() == (WARN, said)
+    expected = 'no odometry for 4 s: no node publishes Odometry; no Range for 4 s: no node publishes Range'
+    assert verdict() == (WARN, expected)
 
 
-def test_stamps_that_are_all_0_are_told_of_though_readings_are_accepted(clock: Any) -> None:
+def test_stamps_of_zero_give_a_warning_if_readings_are_accepted(clock: Any) -> None:
     robot, health = Taking(), Health()
     robot.intake.begin()
     for _ in range(6):
@@ -227,7 +227,7 @@ def test_stamps_that_are_all_0_are_told_of_though_readings_are_accepted(clock: A
     assert 'its stamp has been 0.000 s for 6 s' in text and 'header.stamp' in text
 
 
-def test_what_did_not_come_while_nobody_listened_is_not_missed(clock: Any) -> None:
+def test_inactive_node_does_not_report_missing_messages(clock: Any) -> None:
     robot, health = Taking(), Health()
     robot.intake.begin()
 
@@ -246,7 +246,7 @@ def test_what_did_not_come_while_nobody_listened_is_not_missed(clock: Any) -> No
     assert verdict()[1].startswith('no odometry for 4 s')
 
 
-def test_odometry_that_waits_is_not_missing(clock: Any) -> None:
+def test_waiting_odometry_is_not_reported_as_missing(clock: Any) -> None:
     # for the journal of an earlier run, or for a localiser
     transforms = Transforms()
     early, lost = Taking(), Taking(map_frame=MapFrame('map', transforms, 2.0))
@@ -263,7 +263,7 @@ def test_odometry_that_waits_is_not_missing(clock: Any) -> None:
     assert (level, early.intake.waiting) == (OK, 20)
 
 
-def test_run_em_names_the_transform_that_odometry_waits_for(inside: Any) -> None:
+def test_run_em_names_the_missing_transform(inside: Any) -> None:
     robot = inside().start()
     robot.node._map_frame = robot.node.intake._map_frame = MapFrame('map', Transforms(), 2.0)
     for k in range(10):
@@ -274,7 +274,7 @@ def test_run_em_names_the_transform_that_odometry_waits_for(inside: Any) -> None
     assert 'TF has no transform from map (map_frame) to odom: 10 odometry messages wait for it' in message
 
 
-def test_well_is_said_only_where_readings_are_mapped(inside: Any) -> None:
+def test_end_of_faults_is_logged_only_if_readings_are_mapped(inside: Any) -> None:
     robot = inside().start()
     node, log = robot.node, PlainNode()
     node.reporter._verdicts = VerdictLog(log)
@@ -307,7 +307,7 @@ def reporter_of(robot: Taking) -> Any:
     return made
 
 
-def test_odometry_without_a_frame_is_told_of() -> None:
+def test_odometry_without_a_frame_gives_a_warning() -> None:
     robot = Taking()
     robot.intake.begin()
     reporter = reporter_of(robot)
@@ -323,7 +323,7 @@ def test_odometry_without_a_frame_is_told_of() -> None:
     assert reporter_of(named)._no_frame_id() == [] and named.node.warned == []
 
 
-def test_without_a_base_frame_no_transform_is_asked_for() -> None:
+def test_message_without_a_base_frame_suggests_no_transform() -> None:
     for child, advice in (('base_link', 'publish the transform from base_link'), ('', 'child_frame_id')):
         robot = Taking()
         robot.intake.begin()
@@ -339,13 +339,13 @@ def test_without_a_base_frame_no_transform_is_asked_for() -> None:
         assert text.endswith('its readings are rejected')
 
 
-def test_poses_of_frames_that_nobody_sends_are_named_beside_one_without_a_pose() -> None:
+def test_unused_poses_are_suggested_for_a_frame_without_pose() -> None:
     robot = Taking()
     robot.intake.begin()
     drive(robot, 0, 3, 0)
     reporter = reporter_of(robot)
     reporter._reported, reporter._without_pose, reporter._far = set(), set(), False
-    # one whose readings wait
+    # a frame with waiting readings
     robot.range(200.0, '/waits')
     poses = {name: Pose2(0.1, 0.0, 0.0) for name in ('sonar', 'us_left', 'us_right', 'waits')}
     reporter._extrinsics = Extrinsics(poses, Transforms())

@@ -1,4 +1,4 @@
-"""The table of parameters as ROS has it: what is declared, what is admitted, and what is said of the rest."""
+"""The parameter table in ROS: declared parameters, accepted values, and messages about others."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ ROWS = {row.name: row for row in TABLE}
 
 
 class Declaring:
-    """A node that was made with parameters, as far as declaring others goes."""
+    """Stand-in for a node made with parameter overrides, with what `declare` needs."""
 
     def __init__(self, **given: Any) -> None:
         self.given = {name.replace('__', '.'): SimpleNamespace(value=value) for name, value in given.items()}
@@ -40,7 +40,7 @@ class Declaring:
         self.declared[name] = value
 
 
-def test_every_row_is_declared_with_its_value() -> None:
+def test_each_parameter_is_declared_with_its_value() -> None:
     node = Declaring(p_hit=0.7, max_iterations=7, range_topics=['a', 'b'])
     parameters, poses, warnings = declare(node)
     assert set(node.declared) == set(ROWS)
@@ -54,7 +54,7 @@ def test_every_row_is_declared_with_its_value() -> None:
     assert (poses, warnings) == ({}, [])
 
 
-def test_descriptors_have_words_and_bounds() -> None:
+def test_descriptors_have_descriptions_and_ranges() -> None:
     hit = descriptor(ROWS['p_hit'])
     assert (hit.floating_point_range[0].from_value, hit.floating_point_range[0].to_value) == (
         ROWS['p_hit'].low,
@@ -80,7 +80,7 @@ def test_descriptors_have_words_and_bounds() -> None:
     assert not descriptor(boundless).floating_point_range
 
 
-def test_a_former_name_counts_and_the_new_one_wins() -> None:
+def test_former_name_is_accepted_and_the_new_one_has_priority() -> None:
     parameters, _, warnings = declare(Declaring(max_sweeps=5))
     assert parameters.search.max_iterations == 5
     assert len(warnings) == 1 and 'max_sweeps is called max_iterations now' in warnings[0]
@@ -90,7 +90,7 @@ def test_a_former_name_counts_and_the_new_one_wins() -> None:
     assert len(warnings) == 1
 
 
-def test_names_that_mean_nothing_are_told_of_and_those_of_ros_are_not() -> None:
+def test_unknown_names_give_warnings_except_those_of_ros() -> None:
     given = {'p_hitt': 1, 'use_sim_time': True, 'qos_overrides./a.reliability': 'x', 'cut': 3.0, 'sensors.a.poze': 1}
     node = Declaring()
     node.given = {name: SimpleNamespace(value=value) for name, value in given.items()}
@@ -103,7 +103,7 @@ def test_names_that_mean_nothing_are_told_of_and_those_of_ros_are_not() -> None:
 
 
 @pytest.mark.parametrize('value', [[1, -2, 0.5], (1.0, -2.0, 0.5), array.array('d', [1.0, -2.0, 0.5])])
-def test_poses_of_sensors(value: Any) -> None:
+def test_sensor_poses_are_read(value: Any) -> None:
     node = Declaring()
     node.given = {'sensors.front.left.pose': SimpleNamespace(value=value)}
     assert declare(node)[1] == {'front.left': Pose2(1.0, -2.0, 0.5)}
@@ -113,19 +113,19 @@ def test_poses_of_sensors(value: Any) -> None:
     'value',
     ['abc', [1.0, 2.0], [1.0, 2.0, 3.0, 4.0], [1.0, 2.0, math.nan], [1.0, math.inf, 0.0], ['a', 'b', 'c'], 3, []],
 )
-def test_poses_that_are_none(value: Any) -> None:
+def test_bad_sensor_pose_is_rejected(value: Any) -> None:
     node = Declaring()
     node.given = {'sensors.front.pose': SimpleNamespace(value=value)}
     with pytest.raises(ParameterError, match=r'sensors\.front\.pose: .* is not \[x, y, yaw\]'):
         declare(node)
 
 
-def test_a_value_out_of_range_at_start() -> None:
+def test_value_out_of_range_at_start_is_rejected() -> None:
     with pytest.raises(ParameterError, match=r'p_hit: 2\.0 is out of range'):
         declare(Declaring(p_hit=2.0))
 
 
-def test_what_is_set_at_run_time_is_checked_as_a_whole() -> None:
+def test_values_set_at_run_time_are_checked_together() -> None:
     now = Parameters()
     accepted: list[Parameters] = []
     check = validator(lambda: now, accepted.append)
@@ -152,7 +152,7 @@ def test_what_is_set_at_run_time_is_checked_as_a_whole() -> None:
     assert (result.successful, result.reason) == (False, 'not now')
 
 
-def test_what_configure_reads_can_be_set_before_it() -> None:
+def test_read_only_parameters_can_be_set_before_configure() -> None:
     accepted: list[Parameters] = []
     check = validator(Parameters, accepted.append, lambda: False)
     changes = {'resolution': 0.05, 'range_topics': ['a', 'b'], 'sensors.front.pose': [0.1, 0.0, 0.0]}
@@ -164,7 +164,7 @@ def test_what_configure_reads_can_be_set_before_it() -> None:
     assert len(accepted) == 1
 
 
-def test_a_whole_number_is_taken_for_a_double_where_one_is_wanted() -> None:
+def test_whole_number_is_converted_to_a_double_parameter() -> None:
     changes = [
         RosParameter('sigma', value=1),
         RosParameter('sigma', value=0.5),

@@ -1,4 +1,4 @@
-"""The service save_maps: what is written, under which name, with which warnings; whatever fails, there is an answer."""
+"""The service save_maps: files, names and warnings; each call gets a response, also after errors."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def until(condition: Callable[[], bool]) -> None:
 
 
 class Reply:
-    """An answer that may come from another thread."""
+    """A response that may come from another thread."""
 
     def __init__(self) -> None:
         self.sent: list[tuple[bool, str]] = []
@@ -54,14 +54,14 @@ class Reply:
 
 
 class Node:
-    """What the service asks of the node; `written` is what was handed to `write_results`."""
+    """Stand-in for the node; `written` has the arguments of `write_results`."""
 
     def __init__(self, folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         self.log = PlainNode()
         self.written: list[tuple[Any, ...]] = []
-        self.generation, self.asked, self.accepted = 4, list[Callable[[Outcome], object]](), 10
+        self.generation, self.waiting, self.accepted = 4, list[Callable[[Outcome], object]](), 10
         self.em: Any = SimpleNamespace(maps=None, current=None, explained=10, found=None)
-        self.em.when_there_are_maps = self.asked.append
+        self.em.when_there_are_maps = self.waiting.append
         self.live: Any = SimpleNamespace(
             generation=4, snapshot=lambda: LiveSnapshot(self.generation, GRID, LIVE), worker=None
         )
@@ -85,10 +85,10 @@ class Node:
         return {'warnings': arguments[1]['warnings']}
 
     def save(self, outcome: Outcome | None = None) -> Reply:
-        """Call the service, and have EM end so."""
+        """Call the service, and end EM with this outcome."""
         reply = Reply()
         self.saver.save_maps(reply)  # type: ignore[arg-type]
-        self.asked.pop()(outcome or Outcome(self.maps, ''))
+        self.waiting.pop()(outcome or Outcome(self.maps, ''))
         return reply
 
 
@@ -97,7 +97,7 @@ def node(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Node:
     return Node(tmp_path / 'saved', monkeypatch)
 
 
-def test_the_answer_names_the_files_to_go_on_with(node: Node) -> None:
+def test_response_names_the_main_files(node: Node) -> None:
     success, message = node.save().answer()
     ((folder, maps, source, path_xy, title, options),) = node.written
     assert success and message == (
@@ -111,13 +111,13 @@ def test_the_answer_names_the_files_to_go_on_with(node: Node) -> None:
     assert node.log.warned == ['save_maps: from the node']
 
 
-def test_each_call_finds_a_free_name(node: Node) -> None:
+def test_each_call_uses_a_free_name(node: Node) -> None:
     for _ in range(3):
         assert node.save().answer()[0]
     assert len({folder for folder, *_ in node.written}) == 3
 
 
-def test_a_robot_without_a_path_has_one_of_no_points(node: Node) -> None:
+def test_path_of_a_robot_without_poses_is_empty(node: Node) -> None:
     account = node.account()._replace(path=[])
     node.saver._account = lambda: account
     assert node.save().answer()[0]
@@ -125,28 +125,28 @@ def test_a_robot_without_a_path_has_one_of_no_points(node: Node) -> None:
 
 
 @pytest.mark.parametrize(
-    ('newer', 'said', 'them'),
+    ('newer', 'expected', 'them'),
     [(0, '', ''), (1, '1 reading arrived after EM', 'it'), (7, '7 readings arrived after EM', 'them')],
 )
-def test_readings_that_came_after_em_are_told_of(node: Node, newer: int, said: str, them: str) -> None:
+def test_readings_received_after_em_give_a_warning(node: Node, newer: int, expected: str, them: str) -> None:
     node.accepted += newer
     node.source['warnings'].clear()
     message = node.save().answer()[1]
     warnings = node.written[0][2]['warnings']
-    assert len(warnings) == bool(said) and 'WARNINGS' not in message
-    assert ('arrived after EM' in message) == bool(said)
-    if said:
-        assert message.endswith(f'; {said}')
-        assert warnings[0].startswith(f'{said}: only the live map contains {them};')
+    assert len(warnings) == bool(expected) and 'WARNINGS' not in message
+    assert ('arrived after EM' in message) == bool(expected)
+    if expected:
+        assert message.endswith(f'; {expected}')
+        assert warnings[0].startswith(f'{expected}: only the live map contains {them};')
 
 
-def test_readings_that_were_thinned_are_told_of(node: Node) -> None:
+def test_thinned_readings_give_a_warning(node: Node) -> None:
     node.em.explained = node.accepted = 25
     node.save().answer()
     assert 'EM used 10 of 25 readings' in node.written[0][2]['warnings'][1]
 
 
-def test_whether_it_waits_for_em_is_logged(node: Node) -> None:
+def test_waiting_for_em_is_logged(node: Node) -> None:
     node.save().answer()
     assert not any('waits' in text for text in node.log.warned)
     node.em.current = object()
@@ -158,7 +158,7 @@ def test_whether_it_waits_for_em_is_logged(node: Node) -> None:
     assert not any('waits' in text for text in node.log.warned)
 
 
-def test_without_maps_the_reason_is_the_answer(node: Node) -> None:
+def test_save_without_maps_fails_with_reason(node: Node) -> None:
     assert node.save(Outcome(None, 'EM was cancelled')).answer() == (
         False,
         'there is no map to save: EM was cancelled',
@@ -166,7 +166,7 @@ def test_without_maps_the_reason_is_the_answer(node: Node) -> None:
     assert node.written == [] and node.saver.worker.waiting == 0
 
 
-def test_maps_that_a_reset_overtakes_are_not_written(node: Node) -> None:
+def test_maps_from_before_a_reset_are_not_written(node: Node) -> None:
     node.generation = 5
     success, message = node.save().answer()
     assert not success and 'reset deleted them' in message
@@ -181,7 +181,7 @@ def test_maps_that_a_reset_overtakes_are_not_written(node: Node) -> None:
         (KeyError('odd'), "save_maps failed: KeyError('odd')", "KeyError('odd')"),
     ],
 )
-def test_whatever_fails_is_the_answer(
+def test_error_of_writing_is_the_response(
     node: Node, monkeypatch: pytest.MonkeyPatch, error: Exception, message: str, trouble: str
 ) -> None:
     def fail(*arguments: Any, **options: Any) -> None:
@@ -202,7 +202,7 @@ def trajectory(moved: bool, unplaced: int = 0) -> Found:
     return found  # type: ignore[no-any-return]
 
 
-def test_the_trajectory_is_written_with_the_maps(node: Node, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_trajectory_is_written_with_the_maps(node: Node, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(saver, 'trajectory_data', lambda refinement: {'jumps': refinement.jumps})
     monkeypatch.setattr(saver, 'trajectory_files', lambda refinement, odometry: {'trajectory.tum': odometry})
     node.em.found = trajectory(moved=True)
@@ -213,7 +213,7 @@ def test_the_trajectory_is_written_with_the_maps(node: Node, monkeypatch: pytest
     assert options['extras'] == {'trajectory.tum': 'odometry'}
     assert options['odometry_xy'].tolist() == [[0.0, 1.0], [2.0, 3.0]]
     assert source['warnings'] == ['from the node']
-    # where it stays, the path is odometry's; where part of it has no place, there is a warning
+    # if odometry is kept, the path is that of odometry; if a part could not be placed, there is a warning
     node.em.found = trajectory(moved=False, unplaced=3)
     node.save().answer()
     _, _, source, path_xy, _, options = node.written[-1]

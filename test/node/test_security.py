@@ -1,4 +1,4 @@
-"""The policy for SROS 2 names exactly what the node has, and the node writes only where it was asked to."""
+"""The SROS 2 policy names exactly the topics and services of the node, and the node writes only to its folders."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ WITH_MAP_MSGS = {f'/{NAME}/live_map_updates'}
 
 
 def allowed(tag: str, access: str) -> set[str]:
-    """The names that the policy allows, in full."""
+    """The full names that the policy allows."""
     names = set()
     for group in ElementTree.parse(POLICY).getroot().iter(tag):
         if group.get(access) == 'ALLOW':
@@ -29,7 +29,7 @@ def allowed(tag: str, access: str) -> set[str]:
     return {f'/{name}' for name in names}
 
 
-def test_the_policy_names_what_the_node_has(start: Any, robot: Robot) -> None:
+def test_policy_names_the_topics_and_services_of_the_node(start: Any, robot: Robot) -> None:
     start(*RELIABLE, '-p', 'use_sim_time:=true', '-p', 'refine_poses:=true')
     robot.meet()
     robot.until(lambda: 'readings' in robot.diagnostics)
@@ -47,7 +47,7 @@ def test_the_policy_names_what_the_node_has(start: Any, robot: Robot) -> None:
     assert names(node.get_service_names_and_types_by_node(NAME, '/')) == allowed('services', 'reply')
 
 
-def test_frame_ids_are_no_paths(start: Any, robot: Robot, tmp_path: Path) -> None:
+def test_frame_ids_are_not_used_as_paths(start: Any, robot: Robot, tmp_path: Path) -> None:
     inside = tmp_path / 'inside'
     inside.mkdir()
     wild = '../../outside/sonar'

@@ -1,4 +1,4 @@
-"""The status of the sensors, before EM, after it, and after a reset."""
+"""The status of the sensors before EM, after EM and after a reset."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ def values(status: DiagnosticStatus) -> dict[str, str]:
     return {pair.key: pair.value for pair in status.values}
 
 
-def test_the_dead_sensor_is_named_once_em_has_run() -> None:
+def test_dead_sensor_is_named_after_em() -> None:
     readings = drive(rooms_world(), np.array([[2.0, 2.0], [5.0, 2.0], [5.0, 6.0]]), 0.1, noise=NOISY).readings
     readings = dataclasses.replace(readings, z=np.where(readings.sensor == 4, readings.z_max, readings.z))
     counts = dict(zip(readings.sensor_names, zip(*readings.counts(), strict=True), strict=True))

@@ -1,4 +1,4 @@
-"""Faults around the node that it reports: publishers that it cannot receive from, and nodes of the same name."""
+"""Faults around the node that it reports: incompatible publishers, and nodes with the same name."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from forward_grid_mapper.node.surroundings import Surroundings
 
 
 @pytest.mark.slow
-def test_a_publisher_that_does_not_fit_and_a_namesake(start: Any, robot: Robot) -> None:
+def test_incompatible_publisher_and_a_second_node_of_the_name(start: Any, robot: Robot) -> None:
     options = ('-p', 'range_reliability:=reliable', '-p', 'odom_reliability:=reliable')
     node = start(*options)
     robot.meet()
@@ -25,12 +25,12 @@ def test_a_publisher_that_does_not_fit_and_a_namesake(start: Any, robot: Robot) 
     assert 'no message is received' not in node.output
     best_effort = QoSProfile(depth=5, reliability=ReliabilityPolicy.BEST_EFFORT)
     publisher = robot.node.create_publisher(Range, 'sonar', best_effort)
-    said = 'robot publishes /sonar as best_effort, but this node requests reliable'
-    robot.until(lambda: said in robot.diagnostics['readings']['message'], what='a warning')
+    expected = 'robot publishes /sonar as best_effort, but this node requests reliable'
+    robot.until(lambda: expected in robot.diagnostics['readings']['message'], what='a warning')
     assert robot.diagnostics['readings']['level'] == b'\x01'
     robot.node.destroy_publisher(publisher)
-    robot.until(lambda: said not in robot.diagnostics['readings']['message'], what='it passes')
-    assert node.output.count(said) == 1
+    robot.until(lambda: expected not in robot.diagnostics['readings']['message'], what='it passes')
+    assert node.output.count(expected) == 1
     other = start(*options)
     node.wait_for('2 nodes have the name /forward_grid_mapper', 20.0)
     other.wait_for('2 nodes have the name /forward_grid_mapper', 20.0)
@@ -38,7 +38,7 @@ def test_a_publisher_that_does_not_fit_and_a_namesake(start: Any, robot: Robot) 
 
 
 @pytest.mark.parametrize(
-    ('published', 'said'),
+    ('published', 'expected'),
     [
         ({}, ': no node publishes /sonar'),
         ({'/sonar': 'sensor_msgs/msg/Range'}, ''),
@@ -52,16 +52,16 @@ def test_a_publisher_that_does_not_fit_and_a_namesake(start: Any, robot: Robot) 
         ),
     ],
 )
-def test_why_nothing_comes(published: dict[str, str], said: str) -> None:
+def test_reason_for_missing_messages(published: dict[str, str], expected: str) -> None:
     node = SimpleNamespace(
         get_publishers_info_by_topic=lambda topic: [
             SimpleNamespace(topic_type=kind) for name, kind in published.items() if name == topic
         ],
-        # a topic that is only listened to is there, too
+        # a topic with only subscribers exists as well
         get_topic_names_and_types=lambda: [
             *((name, [kind]) for name, kind in published.items()),
             ('/wanted', ['sensor_msgs/msg/Range']),
         ],
         count_publishers=published.__contains__,
     )
-    assert Surroundings(node, {}).absent('Range', ['/sonar']) == said
+    assert Surroundings(node, {}).absent('Range', ['/sonar']) == expected

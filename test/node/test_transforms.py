@@ -1,4 +1,4 @@
-"""TF from other nodes over DDS, with stand-ins for tf2_ros and tf2_msgs: what is missing is named."""
+"""TF from other nodes over DDS, with stand-ins for tf2_ros and tf2_msgs: missing transforms are reported."""
 
 from __future__ import annotations
 
@@ -29,14 +29,14 @@ class TransformError(Exception):
 
 
 class Buffer:
-    """As `tf2_ros.Buffer`, but that every transform is the sensor's on the robot."""
+    """Stand-in for `tf2_ros.Buffer`; each transform is the pose of the sensor on the robot."""
 
     def __init__(self) -> None:
         self.listener: Any = None
         self.transform: Any = None
 
     def clear(self) -> None:
-        """Static transforms stay."""
+        """Keep static transforms."""
 
     def set_transform_static(self, transform: Any, authority: str) -> None:
         self.transform = transform
@@ -48,7 +48,7 @@ class Buffer:
 
 
 class Listener:
-    """As `tf2_ros.TransformListener`: it asks for what is kept for late subscribers."""
+    """Stand-in for `tf2_ros.TransformListener`, with a transient local subscription."""
 
     def __init__(self, buffer: Any, node: Any, *, spin_thread: bool = False) -> None:
         quality = QoSProfile(depth=100, durability=DurabilityPolicy.TRANSIENT_LOCAL)
@@ -57,7 +57,7 @@ class Listener:
 
 @pytest.fixture(autouse=True)
 def tf2(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Stand-ins; MultiDOFJointState has a field `transforms`, as TFMessage does."""
+    """Stand-ins; MultiDOFJointState has a field `transforms`, like TFMessage."""
     modules = {name: ModuleType(name) for name in ('tf2_ros', 'tf2_msgs', 'tf2_msgs.msg')}
     given: dict[str, Any] = {
         'Buffer': Buffer,
@@ -76,7 +76,7 @@ def tf2(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.fixture
 def player(domain: int) -> Iterator[Callable[[], Any]]:
-    """A node that publishes static transforms as a bag without quality of service does."""
+    """A node that publishes static transforms like a bag without quality of service."""
     context = rclpy.Context()
     made: list[Any] = []
 
@@ -104,9 +104,7 @@ def from_tower(robot: Inside, first: int, count: int) -> None:
     robot.until(lambda: not robot.node.intake.busy)
 
 
-def test_static_transforms_that_are_volatile_are_taken(
-    inside: Callable[..., Inside], player: Callable[..., Any]
-) -> None:
+def test_volatile_static_transforms_are_received(inside: Callable[..., Inside], player: Callable[..., Any]) -> None:
     robot = begun(inside)
     publisher = player()
     robot.until(publisher.get_subscription_count)
@@ -119,7 +117,7 @@ def test_static_transforms_that_are_volatile_are_taken(
     assert 'volatile' not in robot.status('readings')['message']
 
 
-def test_static_transforms_that_came_too_early_are_named(
+def test_static_transforms_published_too_early_are_reported(
     inside: Callable[..., Inside], player: Callable[..., Any]
 ) -> None:
     robot = begun(inside, pose_timeout=0.1, max_pose_gap=0.6)
@@ -140,15 +138,13 @@ def test_static_transforms_that_came_too_early_are_named(
     )
 
 
-def test_static_transforms_that_are_not_reliable_are_named(
-    inside: Callable[..., Inside], player: Callable[..., Any]
-) -> None:
+def test_best_effort_static_transforms_are_reported(inside: Callable[..., Inside], player: Callable[..., Any]) -> None:
     robot = begun(inside)
     player(QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT))
     robot.until(lambda: 'no message is received; set its publisher' in robot.status('readings')['message'])
 
 
-def test_a_map_frame_without_its_transform_is_said_by_name(inside: Callable[..., Inside]) -> None:
+def test_missing_transform_of_the_map_frame_is_reported(inside: Callable[..., Inside]) -> None:
     robot = begun(inside, map_frame='map')
     k = 0
 
@@ -162,7 +158,7 @@ def test_a_map_frame_without_its_transform_is_said_by_name(inside: Callable[...,
     assert 'no odometry' not in message()
 
 
-def test_simulated_time_that_nobody_publishes_is_said(inside: Callable[..., Inside]) -> None:
+def test_simulated_time_without_a_clock_is_reported(inside: Callable[..., Inside]) -> None:
     robot = begun(inside, use_sim_time=True)
     robot.until(lambda: 'use_sim_time is true, but no node publishes /clock' in robot.status('readings')['message'])
     from rosgraph_msgs.msg import Clock
@@ -179,7 +175,7 @@ def test_simulated_time_that_nobody_publishes_is_said(inside: Callable[..., Insi
     robot.until(gone)
 
 
-def test_inclined_and_steep_sensors(inside: Callable[..., Inside]) -> None:
+def test_readings_of_inclined_and_steep_sensors(inside: Callable[..., Inside]) -> None:
     robot = begun(inside)
     pose = Transform()
     buffer: Any = robot.node._extrinsics._transforms._buffer
@@ -194,7 +190,7 @@ def test_inclined_and_steep_sensors(inside: Callable[..., Inside]) -> None:
 
 
 class Log:
-    """A logger whose lines the test reads."""
+    """A logger that keeps its lines."""
 
     def __init__(self) -> None:
         self.lines: list[str] = []
@@ -214,11 +210,11 @@ def log(monkeypatch: pytest.MonkeyPatch) -> Callable[[Inside], Log]:
     return watch
 
 
-def test_the_log_tells_once_of_a_sensor_without_a_pose_and_of_its_pose(
+def test_sensor_without_pose_is_logged_once_and_its_pose_once(
     inside: Callable[..., Inside], log: Callable[[Inside], Log]
 ) -> None:
     robot = begun(inside, pose_timeout=0.1, max_pose_gap=0.6)
-    told, node = log(robot), robot.node
+    lines, node = log(robot), robot.node
     k = 0
     while not node.associator.unknown_frames:
         from_tower(robot, k, 5)
@@ -226,7 +222,7 @@ def test_the_log_tells_once_of_a_sensor_without_a_pose_and_of_its_pose(
         k += 5
     for _ in range(3):
         robot.status('readings')
-    assert told.count('no pose on the robot for sensor tower') == 1
+    assert lines.count('no pose on the robot for sensor tower') == 1
     buffer: Any = node._extrinsics._transforms._buffer
     pose = Transform()
     pose.rotation.w = 1.0
@@ -234,20 +230,20 @@ def test_the_log_tells_once_of_a_sensor_without_a_pose_and_of_its_pose(
     from_tower(robot, k, 5)
     for _ in range(3):
         assert robot.status('readings')['frames without a pose'] == ''
-    assert told.count('sensor tower now has a pose on the robot') == 1
-    # a reset forgets which frames are unknown, and that is no news of a pose
+    assert lines.count('sensor tower now has a pose on the robot') == 1
+    # a reset forgets unknown frames, which is not a new pose
     node.associator.unknown_frames.add('tower')
     robot.status('readings')
     robot.call(node.reset)
     robot.status('readings')
-    assert told.count('now has a pose on the robot') == 1
+    assert lines.count('now has a pose on the robot') == 1
 
 
-def test_the_log_tells_once_of_a_map_frame_without_its_transform_and_of_its_end(
+def test_missing_map_frame_is_logged_once_and_its_end_once(
     inside: Callable[..., Inside], log: Callable[[Inside], Log]
 ) -> None:
     robot = begun(inside, map_frame='map')
-    told, frame, k = log(robot), robot.node._map_frame, 0
+    lines, frame, k = log(robot), robot.node._map_frame, 0
 
     def drive() -> None:
         nonlocal k
@@ -257,22 +253,22 @@ def test_the_log_tells_once_of_a_map_frame_without_its_transform_and_of_its_end(
     robot.until(lambda: (drive(), frame.fault())[1])
     for _ in range(3):
         robot.status('readings')
-    assert told.count('readings are not mapped: TF has no transform from map (map_frame) to odom') == 1
-    # the robot stands still for a while: that is no transform
+    assert lines.count('readings are not mapped: TF has no transform from map (map_frame) to odom') == 1
+    # a pause of the robot does not mean that the transform exists
     robot.until(lambda: not frame.fault())
     robot.status('readings')
-    assert told.count('the transform to map_frame is available') == 0
+    assert lines.count('the transform to map_frame is available') == 0
     pose = Transform()
     pose.rotation.w = 1.0
     frame._transforms._buffer.lookup_transform = lambda *names: SimpleNamespace(transform=pose)
     drive()
     for _ in range(3):
         robot.status('readings')
-    assert told.count('the transform to map_frame is available') == 1
+    assert lines.count('the transform to map_frame is available') == 1
 
 
-def heard_from(robot: Inside, pose: Transform) -> None:
-    """Have readings come from where TF says that the tower is, and be reported on several times."""
+def receive_from(robot: Inside, pose: Transform) -> None:
+    """Receive readings of the tower with this pose in TF, and report them several times."""
     buffer: Any = robot.node._extrinsics._transforms._buffer
     buffer.set_transform_static(pose, '')
     from_tower(robot, 0, 5)
@@ -280,21 +276,19 @@ def heard_from(robot: Inside, pose: Transform) -> None:
         robot.status('readings')
 
 
-def test_the_log_tells_once_of_a_sensor_in_millimetres(
-    inside: Callable[..., Inside], log: Callable[[Inside], Log]
-) -> None:
+def test_sensor_pose_in_millimetres_is_logged_once(inside: Callable[..., Inside], log: Callable[[Inside], Log]) -> None:
     robot = begun(inside)
-    told = log(robot)
+    lines = log(robot)
     pose = Transform()
     pose.translation.x, pose.rotation.w = 150.0, 1.0
-    heard_from(robot, pose)
-    assert told.count('transforms put tower up to 150 m away from the middle of the robot') == 1
+    receive_from(robot, pose)
+    assert lines.count('transforms put tower up to 150 m away from the middle of the robot') == 1
 
 
-def test_the_log_tells_once_of_a_steep_sensor(inside: Callable[..., Inside], log: Callable[[Inside], Log]) -> None:
+def test_steep_sensor_is_logged_once(inside: Callable[..., Inside], log: Callable[[Inside], Log]) -> None:
     robot = begun(inside)
-    told = log(robot)
+    lines = log(robot)
     pose = Transform()
     pose.rotation.y, pose.rotation.w = math.sin(0.75), math.cos(0.75)
-    heard_from(robot, pose)
-    assert told.count('readings of tower are rejected: the sensor points up or down') == 1
+    receive_from(robot, pose)
+    assert lines.count('readings of tower are rejected: the sensor points up or down') == 1

@@ -1,4 +1,4 @@
-"""What the log is told of the input: once what has lasted, and once that it has ended."""
+"""Log lines about faults of the input: once when a fault has lasted, and once when it has ended."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from forward_grid_mapper.node.verdict_log import AGAIN, MOST, VerdictLog
 WELL = 'readings are mapped without faults again'
 
 
-def test_a_fault_that_lasts_is_told_once_whatever_its_numbers(clock: Any) -> None:
+def test_lasting_fault_is_logged_once_at_any_numbers(clock: Any) -> None:
     node = PlainNode()
     log = VerdictLog(node)
     for k in range(3, 200):
@@ -27,7 +27,7 @@ def test_a_fault_that_lasts_is_told_once_whatever_its_numbers(clock: Any) -> Non
     assert node.warned == ['no Range for 4 s', WELL]
 
 
-def test_a_passing_fault_is_not_told(clock: Any) -> None:
+def test_short_fault_is_not_logged(clock: Any) -> None:
     node = PlainNode()
     log = VerdictLog(node)
     for _ in range(5):
@@ -36,7 +36,7 @@ def test_a_passing_fault_is_not_told(clock: Any) -> None:
     assert node.warned == []
 
 
-def test_a_fault_that_comes_and_goes_is_told_once_a_minute(clock: Any) -> None:
+def test_intermittent_fault_is_logged_once_a_minute(clock: Any) -> None:
     node = PlainNode()
     log = VerdictLog(node)
     for _ in range(int(2 * AGAIN) // 3):
@@ -46,7 +46,7 @@ def test_a_fault_that_comes_and_goes_is_told_once_a_minute(clock: Any) -> None:
     assert node.warned == ['gap', WELL] * 2
 
 
-def test_a_fault_that_comes_back_for_good_is_told_though_it_came_early(clock: Any) -> None:
+def test_fault_that_returns_and_lasts_is_logged_again(clock: Any) -> None:
     node = PlainNode()
     log = VerdictLog(node)
     for second in range(300):
@@ -56,7 +56,7 @@ def test_a_fault_that_comes_back_for_good_is_told_though_it_came_early(clock: An
     assert node.warned == ['gap', WELL, 'gap']
 
 
-def test_the_time_in_which_readings_were_rejected_makes_no_new_fault(clock: Any) -> None:
+def test_fault_with_another_period_is_no_new_fault(clock: Any) -> None:
     node = PlainNode()
     log = VerdictLog(node)
     for k in range(300):
@@ -65,7 +65,7 @@ def test_the_time_in_which_readings_were_rejected_makes_no_new_fault(clock: Any)
     assert node.warned == ['1 of 300 readings were rejected in the last 2 s']
 
 
-def test_faults_of_ever_new_names_take_no_memory(clock: Any) -> None:
+def test_number_of_remembered_faults_is_bounded(clock: Any) -> None:
     log = VerdictLog(PlainNode())
     for k in range(5 * MOST):
         name = 'x' * k

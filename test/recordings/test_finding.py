@@ -1,4 +1,4 @@
-"""Which recordings a folder holds, and what of it is named as left out."""
+"""Recordings found in a folder, and the message about entries that are left out."""
 
 from __future__ import annotations
 
@@ -18,13 +18,13 @@ def names_of(folder: Path) -> list[str]:
     return [str(path.relative_to(folder)) for path in find_recordings([folder]).paths]
 
 
-def test_bags_without_metadata_are_bags_as_they_are_alone(tmp_path: Path) -> None:
+def test_bags_without_metadata_are_found(tmp_path: Path) -> None:
     folder = made(tmp_path, 'a/metadata.yaml', 'b/b_0.mcap', 'c/c_0.db3', 'c/c_1.db3', 'd/d_0.mcap.zstd', 'e.bag')
     assert names_of(folder) == ['a', 'b', 'c', 'd', 'e.bag']
     assert find_recordings([folder]).skipped == []
 
 
-def test_what_is_left_out_is_named(tmp_path: Path) -> None:
+def test_entries_left_out_are_named(tmp_path: Path) -> None:
     folder = made(
         tmp_path,
         'a/metadata.yaml',
@@ -39,19 +39,19 @@ def test_what_is_left_out_is_named(tmp_path: Path) -> None:
         '.hidden/b_0.mcap',
     )
     assert names_of(folder) == ['a']
-    (told,) = find_recordings([folder]).skipped
-    assert ': journal, robots, week, night.bag.active; if they are recordings' in told
+    (message,) = find_recordings([folder]).skipped
+    assert ': journal, robots, week, night.bag.active; if they are recordings' in message
 
 
-def test_one_bag_is_no_folder_of_bags(tmp_path: Path) -> None:
+def test_single_bag_is_no_folder_of_bags(tmp_path: Path) -> None:
     for number, names in enumerate((['a_0.mcap', 'a_1.mcap.zstd'], ['a.mcap'], ['a.mcap', 'a.mcap.zstd'])):
         folder = made(tmp_path / str(number), *names)
         assert find_recordings([folder]) == ([folder], [])
-    # files of a split bag are not several drives, whatever lies beside them
+    # files of a split bag are not several drives, even with other bags beside them
     folder = made(tmp_path / 'split', 'a_0.mcap', 'a_1.mcap', 'b/metadata.yaml')
     assert names_of(folder) == ['.']
 
 
-def test_digits_that_are_no_numbers(tmp_path: Path) -> None:
+def test_names_with_superscript_digits_are_sorted(tmp_path: Path) -> None:
     folder = made(tmp_path, '1²2/metadata.yaml', '10/metadata.yaml', '9/metadata.yaml', 'a1²2.mcap', 'b.mcap')
     assert names_of(folder) == ['1²2', '9', '10', 'a1²2.mcap', 'b.mcap']

@@ -1,4 +1,4 @@
-"""Several drives that were refined: which of them say where the map is."""
+"""Several refined drives: the choice of the drives to which others are fitted."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from forward_grid_mapper.recordings import refined
 
 
 def outcome(number: int, accepted: bool, lost: bool = False) -> Refinement:
-    """What became of a drive whose readings all lie at x = `number`."""
+    """Result of a drive whose readings all have x = `number`."""
     readings = Readings.from_columns(
         ('s',), x=np.array([float(number)]), y=0.0, yaw=0.0, z=1.0, z_max=2.0, half_angle=0.1
     )
@@ -28,7 +28,7 @@ def outcome(number: int, accepted: bool, lost: bool = False) -> Refinement:
 @pytest.mark.parametrize(
     ('drives', 'expected'),
     [
-        # (moved, lost) of each drive, and which drives each that was placed was put on
+        # (refined, heading lost) of each drive, and the reference drives of each drive that was fitted
         (((True, False), (False, False)), [{1}]),
         (((True, False), (False, True)), []),
         (((False, True), (True, False), (True, False)), [{1}]),
@@ -36,7 +36,7 @@ def outcome(number: int, accepted: bool, lost: bool = False) -> Refinement:
         (((True, False), (True, False)), [{0}]),
     ],
 )
-def test_nothing_is_fitted_to_a_drive_whose_heading_was_lost(
+def test_no_drive_is_fitted_to_one_with_lost_heading(
     drives: tuple[tuple[bool, bool], ...], expected: list[set[int]], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     fitted_to: list[set[int]] = []

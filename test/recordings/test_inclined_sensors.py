@@ -1,4 +1,4 @@
-"""Bags whose static transforms say that a sensor is inclined."""
+"""Bags with static transforms of inclined sensors."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def bag(tmp_path: Path) -> Path:
 
 
 def read(bag: Path, monkeypatch: pytest.MonkeyPatch, **pitch: float) -> Drive:
-    """The drive of a bag in which these sensors are pitched, radians (REP 103: positive looks down)."""
+    """The drive of a bag with pitched sensors, radians (REP 103: positive looks down)."""
     transforms = StaticTransforms()
     for frame, pose in tape().extrinsics:
         a, b = pose.yaw / 2, pitch.get(frame, 0.0) / 2
@@ -46,16 +46,16 @@ def read(bag: Path, monkeypatch: pytest.MonkeyPatch, **pitch: float) -> Drive:
     return read_drive(bag, Parameters(), {})
 
 
-def of(drive: Drive, frame: str) -> Any:
+def readings_of(drive: Drive, frame: str) -> Any:
     readings = drive.associator.readings
     return readings.select(readings.sensor == readings.sensor_names.index(frame))
 
 
-def test_its_ranges_are_those_of_the_plane(bag: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_ranges_of_an_inclined_sensor_are_projected(bag: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     first, second, *_ = (frame for frame, _ in tape().extrinsics)
     level, inclined = read(bag, monkeypatch), read(bag, monkeypatch, **{first: 0.5, second: -0.3})
     for frame, pitch in ((first, 0.5), (second, -0.3)):
-        before, after = of(level, frame), of(inclined, frame)
+        before, after = readings_of(level, frame), readings_of(inclined, frame)
         for name in ('z', 'z_max'):
             assert getattr(after, name) == pytest.approx(getattr(before, name) * math.cos(pitch))
         assert (after.half_angle > before.half_angle).all()
@@ -63,10 +63,10 @@ def test_its_ranges_are_those_of_the_plane(bag: Path, monkeypatch: pytest.Monkey
     assert inclined.source['warnings'] == level.source['warnings']
 
 
-def test_a_sensor_that_looks_at_the_floor_is_left_out_and_named(bag: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_sensor_that_looks_at_the_floor_is_left_out_and_named(bag: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     first, *others = (frame for frame, _ in tape().extrinsics)
     level, drive = read(bag, monkeypatch), read(bag, monkeypatch, **{first: 1.5})
-    lost = len(of(level, first))
+    lost = len(readings_of(level, first))
     assert drive.source['counts']['rejected'] == {'steep_sensor': lost}
     assert len(drive.associator.readings) == len(level.associator.readings) - lost
     (warning,) = set(drive.source['warnings']) - set(level.source['warnings'])
@@ -74,6 +74,6 @@ def test_a_sensor_that_looks_at_the_floor_is_left_out_and_named(bag: Path, monke
     assert not any(frame in warning for frame in others)
 
 
-def test_a_robot_that_looks_at_the_ceiling_alone_has_no_map(bag: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_drive_with_only_steep_sensors_is_rejected(bag: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     with pytest.raises(InputError, match=r'all .* were rejected: .* steep_sensor .*looks up, more than 60°'):
         read(bag, monkeypatch, **{frame: -1.3 for frame, _ in tape().extrinsics})

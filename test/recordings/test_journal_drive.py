@@ -1,4 +1,4 @@
-"""process_bag on a journal that is not what it should be."""
+"""process_bag with journals that are empty, damaged or of other versions."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ def journal(
     return folder
 
 
-def test_a_journal_without_readings(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_journal_without_readings_is_rejected(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     folder = journal(tmp_path / 'empty', 0)
     assert process_bag([str(folder), '-o', str(tmp_path / 'out')]) == 1
     said = capsys.readouterr().err
@@ -57,7 +57,7 @@ def test_after_a_reset_the_earlier_file_is_named(tmp_path: Path, capsys: pytest.
     assert f'{folder / "drive_0001.journal"}' in said
 
 
-def test_options_that_a_journal_has_no_use_for(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_options_without_effect_on_a_journal_are_reported(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     folder = journal(tmp_path / 'j', 300)
     assert process_bag([str(folder), '-o', str(tmp_path / 'a'), '--odom-topic', 'odom']) == 1
     assert 'leave out' in capsys.readouterr().err
@@ -80,7 +80,7 @@ def test_a_part_has_the_path_of_that_part(tmp_path: Path) -> None:
     assert driven == {'whole': pytest.approx(14.95, abs=0.1), 'part': pytest.approx(5.0, abs=0.1)}
 
 
-def test_a_damaged_journal_is_mapped_as_far_as_it_goes(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_intact_readings_of_a_damaged_journal_are_mapped(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     folder = journal(tmp_path / 'j', 300)
     changed = sqlite3.connect(folder / 'drive_0001.journal')
     rows = np.frombuffer(changed.execute('SELECT rows FROM readings').fetchone()[0], ROW).copy()
@@ -94,7 +94,9 @@ def test_a_damaged_journal_is_mapped_as_far_as_it_goes(tmp_path: Path, capsys: p
     assert (tmp_path / 'out' / 'maps.mcap_bag').is_dir()
 
 
-def test_readings_that_no_map_can_hold_are_refused_in_words(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_readings_outside_the_limits_of_a_map_are_rejected_with_reason(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     far = np.zeros(300)
     far[[5, 7]] = 1.9e7, -1.9e7
     folder = journal(tmp_path / 'far', 300, x=far)
@@ -102,12 +104,14 @@ def test_readings_that_no_map_can_hold_are_refused_in_words(tmp_path: Path, caps
     assert '2 of 300 readings are refused: the map would have more than max_cells' in capsys.readouterr().err
     folder = journal(tmp_path / 'long', 300, z=1e300, z_max=1e308)
     assert process_bag([str(folder), '-o', str(tmp_path / 'b'), '-q']) == 1
-    said = capsys.readouterr().err
-    assert '300 are refused: the cone has millions of cells' in said
-    assert 'Traceback' not in said
+    message = capsys.readouterr().err
+    assert '300 are refused: the cone has millions of cells' in message
+    assert 'Traceback' not in message
 
 
-def test_the_parameters_of_the_node_are_compared(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_parameters_that_differ_from_the_node_give_a_warning(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     folder = journal(tmp_path / 'j', 300, {'resolution': 0.05})
     assert process_bag([str(folder), '-o', str(tmp_path / 'a'), '-q']) == 0
     assert 'the node that kept drive_0001.journal mapped with resolution=0.05' in capsys.readouterr().err
@@ -123,17 +127,17 @@ def test_parameters_that_are_ignored_are_not_reported_as_changed(tmp_path: Path)
     assert list(json.loads((tmp_path / 'a' / 'report.json').read_text())['changed_parameters']) == ['resolution']
 
 
-def test_a_journal_of_the_previous_format(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_journal_of_the_previous_format_gives_a_warning(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (tmp_path / 'drive_0001.journal').write_bytes(Previous.file(300))
     assert process_bag([str(tmp_path), '-o', str(tmp_path / 'a'), '-q']) == 0
     assert 'has the format of the previous version, which the next version will not read' in capsys.readouterr().err
 
 
-def test_a_database_of_another_program(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_database_of_another_program_is_rejected(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     other = sqlite3.connect(tmp_path / 'drive_0001.journal')
     other.execute('CREATE VIEW readings AS WITH RECURSIVE n(i) AS (SELECT 0 UNION ALL SELECT i FROM n) SELECT i FROM n')
     other.close()
     assert process_bag([str(tmp_path), '-o', str(tmp_path / 'a'), '-q']) == 1
-    said = capsys.readouterr().err
-    assert 'is not a journal' in said
-    assert 'Traceback' not in said
+    message = capsys.readouterr().err
+    assert 'is not a journal' in message
+    assert 'Traceback' not in message

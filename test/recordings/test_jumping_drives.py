@@ -1,4 +1,4 @@
-"""A drive whose odometry jumps: what wheels do is asked between jumps, and what could not be placed is warned of."""
+"""Drives with jumps of odometry: errors of the wheels from a part without jumps, and warnings about misplaced parts."""
 
 from __future__ import annotations
 
@@ -31,13 +31,13 @@ def outcome_of(drive: Any, **values: Any) -> Refinement:
 
 
 @pytest.mark.parametrize(('stretch', 'count'), [(None, 10), ((2 * 10**9, 7 * 10**9), 6)])
-def test_what_wheels_do_is_asked_of_a_stretch_without_jumps(
+def test_errors_of_the_wheels_come_from_a_part_without_jumps(
     stretch: tuple[int, int] | None, count: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    asked: list[list[int]] = []
+    lengths: list[list[int]] = []
 
     def certain(readings: Readings, odometry: Odometry, trajectory: Odometry, *_: Any) -> dict[str, Any]:
-        asked.append([len(readings), len(odometry.stamp), len(trajectory.stamp)])
+        lengths.append([len(readings), len(odometry.stamp), len(trajectory.stamp)])
         return {}
 
     monkeypatch.setattr(refined, 'determined_calibration', certain)
@@ -46,14 +46,14 @@ def test_what_wheels_do_is_asked_of_a_stretch_without_jumps(
     odometry = Odometry.of(*drive.associator.odometry)
     for given in (None, refined.Given({'scale': 0.0}, 'c.yaml')):
         refined._estimates(drive, odometry, outcome, Parameters(), lambda stage, part: None, given)
-    assert asked == [[count] * 3] * 2
+    assert lengths == [[count] * 3] * 2
     nothing = Refinement(True, 'placed', drive.associator.readings, outcome.trajectory, {})
     assert refined._estimates(drive, odometry, nothing, Parameters(), lambda stage, part: None, None) == {}
-    assert len(asked) == 2
+    assert len(lengths) == 2
 
 
 @pytest.mark.parametrize('several', [False, True])
-def test_what_could_not_be_placed_is_warned_of(several: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_part_that_could_not_be_placed_gives_a_warning(several: bool, monkeypatch: pytest.MonkeyPatch) -> None:
     one, other = drive_of('a.bag'), drive_of('b.bag')
     outcomes = [outcome_of(one, jumps='odometry jumps', unplaced=True), outcome_of(other, jumps='and is placed')]
     monkeypatch.setattr(refined, '_outcome', lambda drive, *_: outcomes[0 if drive is one else 1])

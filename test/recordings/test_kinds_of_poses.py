@@ -1,4 +1,4 @@
-"""Poses of the robot in messages of other types than Odometry: the same readings come of them."""
+"""Poses of the robot in other message types than Odometry give the same readings."""
 
 from __future__ import annotations
 
@@ -23,10 +23,10 @@ SENSOR = Pose2(0.1, 0.2, 0.5)
 
 
 class PoseWriter(BagWriter):
-    """Writes poses of every kind."""
+    """Writes poses as all message types."""
 
     def write_pose(self, kind: str, topic: str, message: OdometryMessage) -> None:
-        """Write a pose as a message of this type; transforms of others stand beside it."""
+        """Write a pose as a message of this type, together with transforms of other frames."""
         if kind == ODOMETRY:
             self.write_odometry(topic, message)
             return
@@ -50,7 +50,7 @@ class PoseWriter(BagWriter):
 
 
 def written(path: Path, kind: str, topics: tuple[str, ...] = ('/where',), base: str = 'base_link') -> Path:
-    """A bag with ranges, and with poses of this kind on every topic."""
+    """A bag with ranges, and with poses of this type on each topic."""
     with PoseWriter(path, 'mcap') as writer:
         writer.write_static_transforms([(base, 'sonar', SENSOR)], 0)
         for i in range(60):
@@ -79,7 +79,7 @@ def drive_of(path: Path, topic: str | None = None) -> Drive:
         (TF, '/where', '/base_link'),
     ],
 )
-def test_all_kinds_give_the_same_readings(tmp_path: Path, kind: str, topic: str | None, base: str) -> None:
+def test_all_types_of_poses_give_the_same_readings(tmp_path: Path, kind: str, topic: str | None, base: str) -> None:
     expected = drive_of(written(tmp_path / 'odometry', ODOMETRY)).associator
     found = drive_of(written(tmp_path / 'other', kind, base=base), topic).associator
     assert len(expected.readings) == 59
@@ -88,7 +88,7 @@ def test_all_kinds_give_the_same_readings(tmp_path: Path, kind: str, topic: str 
     assert (found.map_frame, found.base_frame) == ('odom', base)
 
 
-def test_odometry_comes_before_stamped_poses_which_may_be_goals(tmp_path: Path) -> None:
+def test_odometry_has_priority_over_stamped_poses(tmp_path: Path) -> None:
     path = tmp_path / 'bag'
     with PoseWriter(path, 'mcap') as writer:
         message = OdometryMessage(0, 'odom', 'base_link', Pose2(0.0, 0.0, 0.0))
@@ -102,22 +102,22 @@ def test_odometry_comes_before_stamped_poses_which_may_be_goals(tmp_path: Path) 
             bag.choose_topics(None, 'goal')
 
 
-def test_several_topics_of_poses_are_named(tmp_path: Path) -> None:
+def test_several_topics_of_poses_require_a_choice(tmp_path: Path) -> None:
     with pytest.raises(BagError, match=r'(?s)several.*/a: 60 messages, odom → base_link.*/b: 60'):
         drive_of(written(tmp_path / 'bag', POSE, ('/a', '/b')))
 
 
-@pytest.mark.parametrize('wish', ['/goal_pose', '/move_base_simple/goal', '/initialpose', '/r1/Goal'])
-def test_goals_are_no_poses_of_the_robot(tmp_path: Path, wish: str) -> None:
+@pytest.mark.parametrize('goal', ['/goal_pose', '/move_base_simple/goal', '/initialpose', '/r1/Goal'])
+def test_goal_topics_are_used_only_by_name(tmp_path: Path, goal: str) -> None:
     for kind in (POSE, POSE_WITH_COVARIANCE):
-        path = written(tmp_path / kind.rpartition('/')[2], kind, (wish,))
+        path = written(tmp_path / kind.rpartition('/')[2], kind, (goal,))
         with pytest.raises(BagError, match=r'no nav_msgs/Odometry'):
             drive_of(path)
-        assert len(drive_of(path, wish).associator.readings) == 59
-    assert drive_of(written(tmp_path / 'both', POSE, (wish, '/where'))).source['odom_topic'] == '/where'
+        assert len(drive_of(path, goal).associator.readings) == 59
+    assert drive_of(written(tmp_path / 'both', POSE, (goal, '/where'))).source['odom_topic'] == '/where'
 
 
-def test_transforms_are_taken_only_if_asked_for(tmp_path: Path) -> None:
+def test_transforms_as_poses_require_the_option(tmp_path: Path) -> None:
     path = written(tmp_path / 'bag', TF, ('/tf',))
     with pytest.raises(BagError, match='--odom-topic /tf` uses the poses of base_link from the transforms of the bag'):
         drive_of(path)

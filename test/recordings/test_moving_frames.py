@@ -1,4 +1,4 @@
-"""Poses of the robot and of its sensors in transforms that move."""
+"""Poses of the robot and of its sensors from changing transforms."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ Links = list[tuple[str, str, Pose2]]
 
 
 class TransformWriter(BagWriter):
-    """Writes transforms that move."""
+    """Writes transforms to /tf."""
 
     def write_transforms(self, links: Links, stamp: int) -> None:
         """Write (parent, child, pose of child in parent) to /tf in one message."""
@@ -46,7 +46,7 @@ def at(i: int) -> Pose2:
 def recorded(
     path: Path, links: list[Any] | None, kind: str = 'mcap', fixed: tuple[str, str] = ('base_link', 'sonar')
 ) -> Path:
-    """A bag whose poses are Odometry, or in each message of `links` transforms, made of the number of the step."""
+    """A bag with poses as Odometry, or as transforms: `links` has those of each message, as functions of the step."""
     with TransformWriter(path, kind) as writer:
         writer.write_static_transforms([(*fixed, SENSOR)], 0)
         for i in range(60):
@@ -73,7 +73,7 @@ ELSEWHERE = ('map', 'odom', lambda i: Pose2(3.0, 1.0, math.pi / 2))
     'messages',
     [[[MOVING, BACK]], [[BACK, MOVING]], [[MOVING], [BACK]], [[BACK], [MOVING]], [[ELSEWHERE, MOVING], [BACK]]],
 )
-def test_links_that_stand_still_below_one_that_moves(tmp_path: Path, messages: list[Any], kind: str) -> None:
+def test_constant_transforms_below_a_changing_one_are_composed(tmp_path: Path, messages: list[Any], kind: str) -> None:
     suffix = '.bag' if kind == 'ros1' else ''
     expected = read(recorded(tmp_path / f'odometry{suffix}', None, kind), None).associator
     found = read(recorded(tmp_path / f'tf{suffix}', messages, kind)).associator
@@ -83,7 +83,7 @@ def test_links_that_stand_still_below_one_that_moves(tmp_path: Path, messages: l
         np.testing.assert_allclose(getattr(found.readings, name), getattr(expected.readings, name), atol=1e-9)
 
 
-def test_the_topmost_link_that_moves_counts(tmp_path: Path) -> None:
+def test_map_frame_is_the_parent_of_the_topmost_changing_transform(tmp_path: Path) -> None:
     drifting = ('map', 'odom', lambda i: Pose2(3.0, 1.0 + (i > 30), math.pi / 2))
     path = recorded(tmp_path / 'bag', [[drifting], [('odom', 'base_link', at)]])
     assert read(path).associator.map_frame == 'map'
@@ -98,27 +98,27 @@ def test_the_topmost_link_that_moves_counts(tmp_path: Path) -> None:
     assert len(poses) == 60
 
 
-def test_a_robot_that_stands_is_where_its_parent_frame_is(tmp_path: Path) -> None:
+def test_robot_at_standstill_is_mapped_in_its_parent_frame(tmp_path: Path) -> None:
     still = ('odom', 'base_link', lambda i: Pose2(1.0, 2.0, 0.0))
     associator = read(recorded(tmp_path / 'bag', [[still]])).associator
     assert (associator.map_frame, len(associator.readings)) == ('odom', 59)
 
 
 @pytest.mark.parametrize('other', [('map', 'base_link', at), ('base_link', 'odom', at)])
-def test_frames_in_doubt_are_left_to_the_parent_of_the_base(tmp_path: Path, other: Any) -> None:
+def test_unclear_frames_use_the_parent_of_the_base(tmp_path: Path, other: Any) -> None:
     associator = read(recorded(tmp_path / 'bag', [[('odom', 'base_link', at)], [other]])).associator
     assert associator.map_frame == 'odom'
     assert len(associator.readings) == 59
 
 
-def test_frames_with_a_prefix_are_named(tmp_path: Path) -> None:
+def test_frames_with_a_prefix_are_rejected_by_name(tmp_path: Path) -> None:
     path = recorded(tmp_path / 'bag', [[('r1/odom', 'r1/base_link', at)]], fixed=('r1/base_link', 'sonar'))
     with pytest.raises(BagError, match=r'neither base_link nor base_footprint, but r1/base_link in r1/odom; .*--poses'):
         read(path)
 
 
 @pytest.mark.parametrize(('frame', 'named'), [('servo', 'sonar on servo'), ('sonar', 'sonar')])
-def test_a_sensor_on_a_joint_is_told(tmp_path: Path, frame: str, named: str) -> None:
+def test_sensor_on_a_moving_joint_is_rejected(tmp_path: Path, frame: str, named: str) -> None:
     servo = ('base_link', frame, lambda i: Pose2(0.1, 0.0, i / 10))
     fixed = ('servo', 'sonar') if frame == 'servo' else ('base_link', 'laser')
     path = recorded(tmp_path / 'bag', [[('odom', 'base_link', at)], [servo]], fixed=fixed)
@@ -128,8 +128,8 @@ def test_a_sensor_on_a_joint_is_told(tmp_path: Path, frame: str, named: str) -> 
 
 @pytest.mark.parametrize('kind', ['mcap', 'ros1'])
 @pytest.mark.parametrize('slash', ['', '/'])
-def test_transforms_that_are_repeated_are_as_good_as_static_ones(tmp_path: Path, kind: str, slash: str) -> None:
-    """As by the static_transform_publisher of ROS 1's tf, and by simulators."""
+def test_repeated_constant_transforms_give_the_mounts(tmp_path: Path, kind: str, slash: str) -> None:
+    """As by the static_transform_publisher of tf in ROS 1, and by simulators."""
     suffix = '.bag' if kind == 'ros1' else ''
     fixed = [
         (f'{slash}base_link', f'{slash}mast', lambda i: Pose2(0.3, -0.1, 0.7)),
@@ -143,14 +143,14 @@ def test_transforms_that_are_repeated_are_as_good_as_static_ones(tmp_path: Path,
     assert drive.source['warnings'] == []
 
 
-def test_transforms_in_millimetres_are_told(tmp_path: Path) -> None:
+def test_transforms_in_millimetres_give_a_warning(tmp_path: Path) -> None:
     fixed = [('base_link', 'mast', lambda i: Pose2(300.0, 0.0, 0.0))]
     path = recorded(tmp_path / 'bag', [[('odom', 'base_link', at)], fixed], fixed=('mast', 'sonar'))
     (warning,) = read(path).source['warnings']
     assert warning.startswith('transforms put sonar up to 300 m away') and 'in millimetres?' in warning
 
 
-def test_static_transforms_are_believed_more_than_repeated_ones(tmp_path: Path) -> None:
+def test_static_transforms_have_priority_over_repeated_ones(tmp_path: Path) -> None:
     fixed = [('base_link', 'mast', lambda i: Pose2(0.3, 0.0, 0.0)), ('mast', 'sonar', lambda i: Pose2(9.0, 9.0, 0.0))]
     path = recorded(tmp_path / 'bag', [[('odom', 'base_link', at)], fixed], fixed=('mast', 'sonar'))
     drive = read(path)
@@ -158,7 +158,7 @@ def test_static_transforms_are_believed_more_than_repeated_ones(tmp_path: Path) 
     assert ['/tf and /tf_static contain different poses' in warning for warning in drive.source['warnings']] == [True]
 
 
-def test_long_recordings_are_not_read_twice_as_a_whole(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_frames_of_long_recordings_are_found_in_a_part(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path = recorded(tmp_path / 'bag', [[MOVING], [BACK]])
     monkeypatch.setattr(reader, 'MOST_SEARCHED', 20)
     with Bag(path) as bag:

@@ -1,4 +1,4 @@
-"""How far the robot drove, whatever the order in which odometry comes."""
+"""The length of the driven path, for odometry in any order."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from forward_grid_mapper.recordings.drive import alternation_note, jumps_note, l
 
 
 def drive(order: np.ndarray, stamps: np.ndarray) -> PoseAssociator:
-    """An associator that got the poses of a drive of ten metres in some order."""
+    """An associator that received the poses of a drive of ten metres in some order."""
     associator = PoseAssociator(lambda base, frame, stamp: None, patient=True)
     for k in order.tolist():
         pose = Pose2(0.1 * k, 0.5 * math.sin(0.02 * k), 0.0)
@@ -22,12 +22,12 @@ def drive(order: np.ndarray, stamps: np.ndarray) -> PoseAssociator:
 
 
 def shuffled(seed: int, count: int) -> np.ndarray:
-    """Poses that overtake others by up to eight messages."""
+    """Indices of poses, up to eight messages out of order."""
     return np.argsort(np.arange(count) + np.random.default_rng(seed).uniform(0.0, 8.0, count))
 
 
 @pytest.mark.parametrize('seed', range(5))
-def test_poses_out_of_order_are_not_driven_twice(seed: int) -> None:
+def test_length_with_poses_out_of_order_is_that_of_sorted_poses(seed: int) -> None:
     stamps = np.arange(1, 102) * 50_000_000
     straight, mixed = drive(np.arange(101), stamps), drive(shuffled(seed, 101), stamps)
     assert length_of(straight) == pytest.approx(10.0, abs=0.1)
@@ -36,20 +36,20 @@ def test_poses_out_of_order_are_not_driven_twice(seed: int) -> None:
     assert arrived > 1.5 * length_of(mixed), 'the sample is out of order'
 
 
-def test_in_order_the_path_is_as_it_came() -> None:
+def test_path_of_poses_in_order_is_unchanged() -> None:
     associator = drive(np.arange(101), np.arange(1, 102) * 50_000_000)
     assert not associator.record.late
     assert np.array_equal(path_of(associator), np.array(associator.path))
 
 
-def test_a_pose_that_comes_again_changes_nothing() -> None:
+def test_repeated_poses_do_not_change_the_path() -> None:
     stamps = np.arange(1, 102) * 50_000_000
     again = drive(np.repeat(np.arange(101), 2), stamps)
     assert again.record.late == 101
     assert np.array_equal(path_of(again), path_of(drive(np.arange(101), stamps)))
 
 
-def test_where_the_clock_jumped_back_the_whole_drive_counts() -> None:
+def test_length_after_a_jump_back_of_time_is_that_of_the_whole_drive() -> None:
     stamps = np.arange(1, 102) * 50_000_000
     stamps[60:] -= 3_000_000_000
     order = np.arange(101)
@@ -59,13 +59,13 @@ def test_where_the_clock_jumped_back_the_whole_drive_counts() -> None:
     assert length_of(associator) == pytest.approx(10.2, abs=0.1)
 
 
-def test_nothing_and_one_place_have_no_length() -> None:
+def test_length_of_no_pose_or_one_pose_is_zero() -> None:
     for count in (0, 1):
         associator = drive(np.arange(count), np.arange(1, 102) * 50_000_000)
         assert length_of(associator) == 0.0
 
 
-def test_a_jump_is_not_driven() -> None:
+def test_jump_is_not_part_of_the_length() -> None:
     associator = PoseAssociator(lambda base, frame, stamp: None, patient=True)
     for k in range(101):
         x = 0.1 * k + (30.0 if k > 40 else 0.0)
@@ -73,16 +73,16 @@ def test_a_jump_is_not_driven() -> None:
     assert length_of(associator) == pytest.approx(9.9, abs=0.1)
     (note,) = jumps_note(associator)
     assert 'jumps once, by 30.1 m after 4 m' in note and '--refine-poses' in note
-    # messages that are missing are
+    # the distance over missing messages counts
     associator.add_odometry(OdometryMessage(20 * 10**9, 'odom', 'base_link', Pose2(44.0, 0.0, 0.0)))
     assert length_of(associator) == pytest.approx(13.9, abs=0.1)
 
 
-def test_neither_driving_nor_poses_in_another_unit_are_jumps() -> None:
+def test_driving_and_poses_in_other_units_are_no_jumps() -> None:
     for metres, messages in ((0.1, 100), (2.5, 100), (100.0, 100), (0.0, 1)):
         associator = PoseAssociator(lambda base, frame, stamp: None, patient=True)
         for k in range(messages):
-            # a second each: fast, and far too fast
+            # one second each: fast, and much too fast
             associator.add_odometry(OdometryMessage((k + 1) * 10**9, 'odom', 'base_link', Pose2(metres * k, 0.0, 0.0)))
         assert jumps_note(associator) == []
 
@@ -96,13 +96,13 @@ def poses_of(points: list[tuple[float, float]], period: float = 0.05) -> PoseAss
 
 
 @pytest.mark.parametrize(('every', 'steps'), [(2, 99), (5, 40), (15, 14)])
-def test_two_sources_of_poses_on_one_topic_are_told(every: int, steps: int) -> None:
+def test_two_sources_of_poses_on_one_topic_give_a_warning(every: int, steps: int) -> None:
     points = [(0.02 * k, 0.5 * (k % every == every // 2)) for k in range(100)]
     (note,) = alternation_note(poses_of(points))
     assert f'by 0.50 m in {steps} of 99 steps; do two nodes publish' in note
 
 
-def test_what_is_no_second_source_is_not_told() -> None:
+def test_other_patterns_of_poses_give_no_warning_of_two_sources() -> None:
     generator = np.random.default_rng(0)
     fast = [(2.9 * 0.05 * (k if k < 50 else 100 - k), 0.0) for k in range(100)]
     noisy = [(0.02 * k + e, 0.0) for k, e in enumerate(generator.normal(0.0, 0.03, 100).tolist())]

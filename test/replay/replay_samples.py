@@ -1,4 +1,4 @@
-"""A short bag, `replay_bag` in a process of its own, and a listener to what it publishes."""
+"""A short bag, `replay_bag` in a separate process, and a listener to its topics."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ def write_bag(
     period: float = 0.1,
     topic: Callable[[str], str] = lambda frame: '/sonar',
 ) -> Path:
-    """Write ranges of two sensors and odometry in turn, all stamps different; return the bag's path."""
+    """Write ranges of two sensors and odometry alternately, with different stamps; return the path of the bag."""
     path = folder / ('drive.bag' if kind == 'ros1' else 'drive')
     with BagWriter(path, kind) as writer:
         writer.write_static_transforms(EXTRINSICS, START)
@@ -60,13 +60,13 @@ def write_bag(
 
 
 def messages_in(path: Path, odom_topic: str | None = None) -> list[RangeMessage | OdometryMessage]:
-    """What the offline tool would read from a bag."""
+    """The messages that the offline tool reads from a bag."""
     with Bag(path) as bag:
         return list(bag.messages(bag.choose_topics(None, odom_topic)))
 
 
 class Replay:
-    """`replay_bag` in a process of its own."""
+    """`replay_bag` in a separate process."""
 
     def __init__(self, environment: Mapping[str, str], *arguments: object) -> None:
         command = [sys.executable, '-m', 'forward_grid_mapper', 'replay_bag', *map(str, arguments)]
@@ -82,7 +82,7 @@ class Replay:
 
     @property
     def running(self) -> bool:
-        """Whether it goes on."""
+        """Whether it is running."""
         return self._process.poll() is None
 
     def end(self, seconds: float = 30.0) -> tuple[int, str, str]:
@@ -91,14 +91,14 @@ class Replay:
         return self._process.returncode, out, err
 
     def kill(self) -> None:
-        """End it if a test has failed before its end."""
+        """Kill it if a test has failed before it ended."""
         if self.running:
             self._process.kill()
             self._process.communicate(timeout=PATIENCE)
 
 
 class Listener:
-    """Keeps every message of some topics in the order of arrival, as (topic, message)."""
+    """Keeps all messages of some topics in the order of arrival, as (topic, message)."""
 
     def __init__(self, domain: int, topics: Mapping[str, str], *, reliable: bool = True, latched: bool = False) -> None:
         import rclpy
@@ -123,18 +123,18 @@ class Listener:
         return lambda message: self.got.append((topic, message))
 
     def spin(self, *, until: Callable[[], bool], seconds: float = 20.0) -> None:
-        """Take messages until a condition holds, which it must."""
+        """Receive messages until the condition holds, which must happen."""
         deadline = time.monotonic() + seconds
         while not until():
             assert time.monotonic() < deadline, f'{len(self.got)} messages came, then none'
             self._executor.spin_once(timeout_sec=0.05)
 
     def publisher_of(self, topic: str) -> bool:
-        """Whether somebody publishes a topic."""
+        """Whether a topic has a publisher."""
         return bool(self._node.count_publishers(topic))
 
     def receive(self, replay: Replay) -> tuple[int, str, str]:
-        """Take messages until a replay has ended; return its exit code, output and errors."""
+        """Receive messages until a replay has ended; return its exit code, output and errors."""
         self.spin(until=lambda: not replay.running)
         self.spin(until=lambda: True)
         return replay.end()
@@ -145,7 +145,7 @@ class Listener:
 
     @property
     def plain(self) -> list[RangeMessage | OdometryMessage]:
-        """Ranges and odometry in the order of their stamps: two topics may overtake each other."""
+        """Ranges and odometry by stamp, since the order between two topics may differ."""
         made: list[RangeMessage | OdometryMessage] = []
         for _, message in self.got:
             if hasattr(message, 'child_frame_id'):
@@ -155,14 +155,14 @@ class Listener:
         return sorted(made, key=lambda message: message.stamp)
 
     def close(self) -> None:
-        """Leave."""
+        """Close the node."""
         self._executor.shutdown()
         self._node.destroy_node()
         self._context.try_shutdown()
 
 
 class Wire:
-    """A DDS domain of its own, in which replays and listeners end with the test."""
+    """A separate DDS domain, in which replays and listeners end with the test."""
 
     def __init__(self, domain: int, environment: Mapping[str, str]) -> None:
         self._domain = domain
@@ -176,20 +176,20 @@ class Wire:
         return made
 
     def listen(self, topics: Mapping[str, str] = SENSORS, **quality: bool) -> Listener:
-        """Start to listen."""
+        """Start a listener."""
         made = Listener(self._domain, topics, **quality)
         self._open.append(made)
         return made
 
     def close(self) -> None:
-        """End what a test has left."""
+        """End all replays and listeners that are still open."""
         for thing in self._open:
             thing.kill() if isinstance(thing, Replay) else thing.close()
 
 
 @contextmanager
 def wire(domain: int) -> Iterator[Wire]:
-    """Yield a `Wire`; skip where ROS is not installed."""
+    """Yield a `Wire`; skip the test if ROS is not installed."""
     pytest.importorskip('rclpy', reason='rclpy is not installed (the extra ros, or a sourced ROS 2)')
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv('ROS_DOMAIN_ID', str(domain))

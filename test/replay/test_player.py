@@ -1,4 +1,4 @@
-"""What is published, and in which order, with a bag and publishers that are made up."""
+"""The published messages and their order, with stand-ins for the bag and the publishers."""
 
 from __future__ import annotations
 
@@ -19,8 +19,8 @@ TOPICS = Topics(('sonar',), 'odom')
 NAMES = {'sonar': '/sonar', 'odom': '/odom', '/clock': '/clock'}
 
 
-class MadeUpBag:
-    """Yields messages that have nothing but a stamp; None stands for one of another definition."""
+class FakeBag:
+    """Yields messages with only a stamp; None stands for a message of another definition."""
 
     path = Path('made_up')
 
@@ -44,7 +44,7 @@ class MadeUpBag:
 
 
 class Log:
-    """Publishers that keep (topic, time) of what they are given, and a signal that comes after some of them."""
+    """Publishers that keep (topic, time) of all messages, and a stop signal after some of them."""
 
     def __init__(self, stop_after: int = 1000) -> None:
         self.published: list[tuple[str, int]] = []
@@ -67,24 +67,24 @@ class Log:
         return self.is_set()
 
 
-def player(bag: MadeUpBag, log: Log, clock: float | None = None) -> Player:
+def player(bag: FakeBag, log: Log, clock: float | None = None) -> Player:
     doubles: Any = (bag, log)
     return Player(doubles[0], TOPICS, NAMES, doubles[1], doubles[1], clock, lambda text: None)
 
 
-def test_messages_are_counted_and_go_out_under_their_new_names() -> None:
+def test_messages_are_counted_and_published_on_renamed_topics() -> None:
     log = Log()
-    made = player(MadeUpBag(('odom', START), ('sonar', START + 5), ('odom', START + 9)), log)
+    made = player(FakeBag(('odom', START), ('sonar', START + 5), ('odom', START + 9)), log)
     made.play(1.0, 'replaying')
     assert log.published == [('/odom', START), ('/sonar', START + 5), ('/odom', START + 9)]
     assert made.played == {RANGE: 1, ODOMETRY: 2}
 
 
-def test_transforms_go_out_between_the_messages_around_them() -> None:
+def test_transforms_are_published_between_other_messages() -> None:
     log = Log()
     # that of a broadcaster whose stamps are an hour ahead
     later = START + 3600 * NANOSECONDS
-    bag: Any = MadeUpBag(
+    bag: Any = FakeBag(
         ('tf', START), ('odom', START), ('tf', later), ('sonar', START + NANOSECONDS // 10), ('tf', later)
     )
     doubles: Any = log
@@ -100,34 +100,34 @@ def test_transforms_go_out_between_the_messages_around_them() -> None:
     assert made.played == {RANGE: 1, ODOMETRY: 1} and not made.jumps
 
 
-def test_a_message_of_another_definition_is_skipped() -> None:
-    made = player(MadeUpBag(('odom', START), ('sonar', None), ('sonar', START + 5)), Log())
+def test_message_of_another_definition_is_skipped() -> None:
+    made = player(FakeBag(('odom', START), ('sonar', None), ('sonar', START + 5)), Log())
     made.play(1.0, 'replaying')
     assert made.unusable == {'sonar': 1}
     assert made.played == {RANGE: 1, ODOMETRY: 1}
 
 
-def test_a_bag_without_a_readable_message_is_an_error() -> None:
+def test_bag_without_a_readable_message_is_an_error() -> None:
     with pytest.raises(BagError, match='made_up'):
-        player(MadeUpBag(('sonar', None)), Log()).play(1.0, 'replaying')
+        player(FakeBag(('sonar', None)), Log()).play(1.0, 'replaying')
 
 
-def test_nothing_is_published_after_a_signal() -> None:
+def test_no_messages_are_published_after_a_signal() -> None:
     log = Log(stop_after=2)
-    player(MadeUpBag(*(('odom', START + i) for i in range(9))), log).play(1.0, 'replaying')
+    player(FakeBag(*(('odom', START + i) for i in range(9))), log).play(1.0, 'replaying')
     assert len(log.published) == 2
 
 
-def test_a_signal_before_the_first_message_is_no_error() -> None:
+def test_signal_before_the_first_message_is_no_error() -> None:
     log = Log(stop_after=0)
-    player(MadeUpBag(('odom', START)), log).play(1.0, 'replaying')
+    player(FakeBag(('odom', START)), log).play(1.0, 'replaying')
     assert log.published == []
 
 
-def test_the_clock_is_never_behind_the_message_that_follows() -> None:
+def test_clock_is_not_behind_the_next_message() -> None:
     log = Log()
     stamps = [START, START + NANOSECONDS // 50, START + NANOSECONDS // 25]
-    player(MadeUpBag(*(('odom', stamp) for stamp in stamps)), log, clock=200.0).play(1.0, 'replaying')
+    player(FakeBag(*(('odom', stamp) for stamp in stamps)), log, clock=200.0).play(1.0, 'replaying')
     assert log.published[0] == ('/clock', START)
     assert [time for topic, time in log.published if topic == '/odom'] == stamps
     latest = 0

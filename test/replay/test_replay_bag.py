@@ -26,7 +26,7 @@ def stamps_of(messages: list[Any]) -> list[int]:
 
 
 @pytest.mark.parametrize('kind', ['mcap', 'sqlite3', 'ros1'])
-def test_every_message_arrives_in_order_as_it_was(dds: Wire, tmp_path: Path, kind: str) -> None:
+def test_all_messages_arrive_unchanged_and_in_order(dds: Wire, tmp_path: Path, kind: str) -> None:
     bag = write_bag(tmp_path, kind)
     listener = dds.listen()
     code, out, err = listener.receive(dds.replay(bag, '--rate', 10))
@@ -41,7 +41,7 @@ def test_every_message_arrives_in_order_as_it_was(dds: Wire, tmp_path: Path, kin
     assert all(message.radiation_type == 0 for message in listener.on('/sonar'))
 
 
-def test_a_best_effort_listener_hears_everything(dds: Wire, tmp_path: Path) -> None:
+def test_best_effort_listener_receives_all_messages(dds: Wire, tmp_path: Path) -> None:
     bag = write_bag(tmp_path, topic=lambda frame: f'/{frame}')
     topics = {'/sonar_0': RANGE, '/sonar_1': RANGE, '/odom': ODOMETRY}
     listener = dds.listen(topics, reliable=False)
@@ -52,7 +52,7 @@ def test_a_best_effort_listener_hears_everything(dds: Wire, tmp_path: Path) -> N
 
 
 @pytest.mark.slow
-def test_a_real_drive_arrives_whole(dds: Wire, shared: Path) -> None:
+def test_all_messages_of_a_real_drive_arrive(dds: Wire, shared: Path) -> None:
     bag = shared / 'data' / 'office_a' / 'bag'
     options = ('--odom-topic', '/odom', '--rate', 60)
     listener = dds.listen({**{f'/sonar_{i}': RANGE for i in range(8)}, '/odom': ODOMETRY})
@@ -61,7 +61,7 @@ def test_a_real_drive_arrives_whole(dds: Wire, shared: Path) -> None:
     assert sorted(map(repr, listener.plain)) == sorted(map(repr, messages_in(bag, '/odom')))
 
 
-def test_it_keeps_the_pace_of_the_stamps(dds: Wire, tmp_path: Path) -> None:
+def test_replay_follows_the_stamps_in_real_time(dds: Wire, tmp_path: Path) -> None:
     bag = write_bag(tmp_path, count=5, period=1.0)
     arrived = []
     listener = dds.listen(reliable=False)
@@ -70,12 +70,12 @@ def test_it_keeps_the_pace_of_the_stamps(dds: Wire, tmp_path: Path) -> None:
         count = len(listener.on('/odom'))
         listener.spin(until=lambda count=count: len(listener.on('/odom')) > count or not replay.running)
         arrived.append(time.monotonic())
-    # four gaps of a quarter of a second; a busy machine may be late
+    # four gaps of a quarter of a second; a busy machine may be slower
     assert 0.8 < arrived[4] - arrived[0] < 4.0
     assert replay.end()[0] == 0
 
 
-def test_the_clock_follows_the_bag_and_ticks_between_messages(dds: Wire, tmp_path: Path) -> None:
+def test_clock_follows_the_bag_and_ticks_between_messages(dds: Wire, tmp_path: Path) -> None:
     bag = write_bag(tmp_path, count=5, period=1.0)
     listener = dds.listen({**SENSORS, '/clock': CLOCK})
     code, _, err = listener.receive(dds.replay(bag, '--rate', 4, '--clock', 20))
@@ -85,13 +85,13 @@ def test_the_clock_follows_the_bag_and_ticks_between_messages(dds: Wire, tmp_pat
     last = START + 4 * NANOSECONDS + 1000
     assert times[0] == START
     assert times[-1] == last
-    # the second between two messages has five ticks, if the machine is not busy
+    # five ticks in the second between two messages, if the machine is not busy
     assert 14 < len(times) < 45
     assert max(b - a for a, b in pairwise(times)) < 0.95 * NANOSECONDS
 
 
 @pytest.mark.slow
-def test_it_plays_as_often_as_asked(dds: Wire, tmp_path: Path) -> None:
+def test_bag_is_played_the_given_number_of_times(dds: Wire, tmp_path: Path) -> None:
     bag = write_bag(tmp_path, count=10)
     listener = dds.listen({**SENSORS, '/clock': CLOCK})
     code, out, err = listener.receive(dds.replay(bag, '--rate', 10, '--loop', 2, '--clock'))
@@ -102,7 +102,7 @@ def test_it_plays_as_often_as_asked(dds: Wire, tmp_path: Path) -> None:
     assert sum(b < a for a, b in pairwise(times)) == 1
 
 
-def test_it_waits_for_all_its_listeners(dds: Wire, tmp_path: Path) -> None:
+def test_replay_waits_for_subscribers_of_all_topics(dds: Wire, tmp_path: Path) -> None:
     bag = write_bag(tmp_path)
     early = dds.listen({'/sonar': RANGE}, reliable=False)
     replay = dds.replay(bag, '--rate', 20)
@@ -115,7 +115,7 @@ def test_it_waits_for_all_its_listeners(dds: Wire, tmp_path: Path) -> None:
     assert replay.end()[0] == 0
 
 
-def test_without_listeners_it_names_the_topics(dds: Wire, tmp_path: Path) -> None:
+def test_replay_without_subscribers_fails_with_the_topics(dds: Wire, tmp_path: Path) -> None:
     code, out, err = dds.replay(write_bag(tmp_path), '--wait', 0.2).end()
     assert (code, out) == (1, '')
     assert 'Traceback' not in err
@@ -125,7 +125,7 @@ def test_without_listeners_it_names_the_topics(dds: Wire, tmp_path: Path) -> Non
 
 
 @pytest.mark.slow
-def test_with_listeners_that_do_not_fit_it_says_why(dds: Wire, tmp_path: Path) -> None:
+def test_replay_with_incompatible_subscribers_fails_with_reason(dds: Wire, tmp_path: Path) -> None:
     listener = dds.listen({'/robot/odom': ODOMETRY, '/sonar': RANGE})
     replay = dds.replay(write_bag(tmp_path), '--wait', 8, '--best-effort')
     code, _, err = listener.receive(replay)
@@ -134,7 +134,7 @@ def test_with_listeners_that_do_not_fit_it_says_why(dds: Wire, tmp_path: Path) -
     assert '/sonar: listener requests reliable' in err
 
 
-def test_topics_can_be_renamed(dds: Wire, tmp_path: Path) -> None:
+def test_topics_can_be_remapped(dds: Wire, tmp_path: Path) -> None:
     bag = write_bag(tmp_path)
     listener = dds.listen({'/robot/odom': ODOMETRY, '/robot/sonar': RANGE}, reliable=False)
     options = ('--rate', 20, '--remap', 'odom:=/robot/odom', '--ros-args', '-r', '/sonar:=/robot/sonar')
@@ -144,7 +144,7 @@ def test_topics_can_be_renamed(dds: Wire, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize('number', [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
-def test_a_signal_that_comes_twice_ends_it_in_order(dds: Wire, tmp_path: Path, number: signal.Signals) -> None:
+def test_second_signal_ends_the_replay_normally(dds: Wire, tmp_path: Path, number: signal.Signals) -> None:
     listener = dds.listen()
     replay = dds.replay(write_bag(tmp_path), '--loop')
     listener.spin(until=lambda: len(listener.got) > 4)
@@ -157,9 +157,9 @@ def test_a_signal_that_comes_twice_ends_it_in_order(dds: Wire, tmp_path: Path, n
     assert 'Traceback' not in err
 
 
-def test_it_can_be_stopped_while_it_waits(dds: Wire, tmp_path: Path) -> None:
+def test_replay_can_be_stopped_while_it_waits(dds: Wire, tmp_path: Path) -> None:
     replay = dds.replay(write_bag(tmp_path))
-    # that of one topic is too few to begin
+    # a subscriber of one topic is not sufficient to begin
     listener = dds.listen({'/sonar': RANGE})
     listener.spin(until=lambda: listener.publisher_of('/odom'))
     replay.signal(signal.SIGINT)
@@ -168,7 +168,7 @@ def test_it_can_be_stopped_while_it_waits(dds: Wire, tmp_path: Path) -> None:
     assert 'stopped after 0 Range' in out
 
 
-def test_without_tf2_it_says_what_the_mapper_lacks(dds: Wire, tmp_path: Path) -> None:
+def test_replay_without_tf2_warns_of_missing_sensor_poses(dds: Wire, tmp_path: Path) -> None:
     try:
         import tf2_msgs.msg  # noqa: F401
     except ImportError:
@@ -181,7 +181,7 @@ def test_without_tf2_it_says_what_the_mapper_lacks(dds: Wire, tmp_path: Path) ->
     assert 'sensors.FRAME.pose' in err
 
 
-def test_static_transforms_reach_whoever_comes_later(dds: Wire, tmp_path: Path) -> None:
+def test_late_subscriber_receives_static_transforms(dds: Wire, tmp_path: Path) -> None:
     pytest.importorskip('tf2_msgs.msg', reason='tf2_msgs is not installed')
     replay = dds.replay(write_bag(tmp_path))
     time.sleep(1.0)

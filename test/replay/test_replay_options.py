@@ -1,4 +1,4 @@
-"""What `replay_bag` says before anything is published."""
+"""Options of `replay_bag`, and errors before it publishes."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ TOPICS = {'/sonar': RANGE, 'odom': ODOMETRY}
         (['--reliable', '--best-effort'], '--best-effort'),
     ],
 )
-def test_wrong_options_are_named(capsys: pytest.CaptureFixture[str], options: list[str], named: str) -> None:
+def test_wrong_option_is_rejected_by_name(capsys: pytest.CaptureFixture[str], options: list[str], named: str) -> None:
     with pytest.raises(SystemExit) as leaving:
         replay_bag.main(['bag', *options])
     assert leaving.value.code == 2
@@ -44,18 +44,18 @@ def test_wrong_options_are_named(capsys: pytest.CaptureFixture[str], options: li
 
 
 @pytest.mark.parametrize('option', ['--loop', '--clock'])
-def test_a_bag_that_an_option_would_swallow_is_noticed(capsys: pytest.CaptureFixture[str], option: str) -> None:
+def test_bag_taken_as_the_value_of_an_option_is_reported(capsys: pytest.CaptureFixture[str], option: str) -> None:
     with pytest.raises(SystemExit):
         replay_bag.main([option, 'drive'])
     assert 'the bag goes before the options' in capsys.readouterr().err
 
 
-def test_a_missing_bag_is_told(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+def test_missing_bag_is_reported(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
     assert replay_bag.main([str(tmp_path / 'none')]) == 1
     assert 'does not exist' in capsys.readouterr().err
 
 
-def test_several_odometry_topics_are_the_users_choice(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+def test_several_odometry_topics_require_a_choice(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
     with BagWriter(tmp_path / 'bag') as writer:
         writer.write_range('/sonar', RangeMessage(START, 'sonar_0', 1.0, 0.1, 5.0, 0.25))
         for topic in ('/odom', '/wheels'):
@@ -66,7 +66,7 @@ def test_several_odometry_topics_are_the_users_choice(capsys: pytest.CaptureFixt
     assert '/wheels' in err
 
 
-def test_without_ros_it_says_how_to_get_it(
+def test_missing_ros_is_reported_with_a_remedy(
     capsys: pytest.CaptureFixture[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setitem(sys.modules, 'rclpy', None)
@@ -80,7 +80,7 @@ def test_topics_keep_their_names_with_a_leading_slash() -> None:
     assert renamed(TOPICS, []) == {'/sonar': '/sonar', 'odom': '/odom'}
 
 
-def test_topics_are_renamed_with_or_without_slash() -> None:
+def test_topics_are_remapped_with_or_without_slash() -> None:
     assert renamed(TOPICS, ['sonar:=a/b', '/odom:=/c']) == {'/sonar': '/a/b', 'odom': '/c'}
 
 
@@ -94,12 +94,12 @@ def test_topics_are_renamed_with_or_without_slash() -> None:
         ('/sonar:=/odom', 'two types'),
     ],
 )
-def test_a_wrong_renaming_is_reported(remap: str, reported: str) -> None:
+def test_wrong_remapping_is_reported(remap: str, reported: str) -> None:
     with pytest.raises(ParameterError, match=reported):
         renamed(TOPICS, [remap])
 
 
-def test_arguments_are_parted_as_ros_parts_them() -> None:
+def test_ros_arguments_are_split_as_in_ros() -> None:
     given = ['bag', '--ros-args', '-r', 'a:=b', '--', '--rate', '2', '--ros-args', '--log-level', 'debug']
     own, ros = replay_bag.split_ros_arguments(given)
     assert own == ['bag', '--rate', '2']
@@ -107,7 +107,7 @@ def test_arguments_are_parted_as_ros_parts_them() -> None:
 
 
 @pytest.mark.parametrize('number', [signal.SIGTERM, signal.SIGHUP])
-def test_a_signal_ends_a_wait_at_once_and_the_next_one_is_harmless(number: signal.Signals) -> None:
+def test_signal_ends_a_wait_at_once_and_a_second_one_has_no_effect(number: signal.Signals) -> None:
     before = {each: signal.getsignal(each) for each in (signal.SIGTERM, signal.SIGHUP)}
     try:
         with StopSignal() as stop:
@@ -125,7 +125,7 @@ def test_a_signal_ends_a_wait_at_once_and_the_next_one_is_harmless(number: signa
         signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
-def test_a_replay_under_nohup_survives_its_terminal() -> None:
+def test_replay_under_nohup_survives_its_terminal() -> None:
     before = signal.signal(signal.SIGHUP, signal.SIG_IGN)
     try:
         with StopSignal() as stop:
@@ -136,7 +136,7 @@ def test_a_replay_under_nohup_survives_its_terminal() -> None:
         signal.signal(signal.SIGHUP, before)
 
 
-def test_signals_go_back_to_who_had_them() -> None:
+def test_signal_handlers_are_restored() -> None:
     before = signal.getsignal(signal.SIGINT)
     with StopSignal() as stop:
         assert signal.getsignal(signal.SIGINT) != before
@@ -206,7 +206,7 @@ def test_moving_transforms_are_replayed_between_the_readings(tmp_path: Path, mon
     ] * 4
 
 
-def test_transforms_are_reliable_and_wait_for_nobody() -> None:
+def test_transforms_are_reliable_and_wait_for_no_subscribers() -> None:
     qos = pytest.importorskip('rclpy.qos', reason='rclpy is not installed')
     made: list[Any] = []
     publishers: Any = publishing.Publishers([], False, StopSignal())
@@ -217,7 +217,7 @@ def test_transforms_are_reliable_and_wait_for_nobody() -> None:
     assert (quality.history, quality.depth) == (qos.HistoryPolicy.KEEP_LAST, 100)
 
 
-def test_without_tf2_a_warning_says_that_moving_transforms_are_missing(
+def test_missing_tf2_gives_a_warning_about_moving_transforms(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     def missing(msgtype: str) -> type:

@@ -1,4 +1,4 @@
-"""What is published has every field of what was recorded."""
+"""Published messages have all fields of the recorded ones."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ STORES = {'jazzy': Stores.ROS2_JAZZY, 'humble': Stores.ROS2_HUMBLE, 'ros1': Stor
 
 
 class Maker:
-    """Makes messages as rosbags does, for one distribution."""
+    """Makes messages of rosbags for one distribution."""
 
     def __init__(self, distribution: str) -> None:
         self.name = distribution
@@ -39,7 +39,7 @@ def maker(request: pytest.FixtureRequest) -> Maker:
     return Maker(request.param)
 
 
-def test_a_range_keeps_all_its_fields(maker: Maker) -> None:
+def test_range_keeps_all_fields(maker: Maker) -> None:
     extra = {'variance': np.float32(0.25)} if maker.name == 'jazzy' else {}
     source = maker.make(
         'sensor_msgs/msg/Range',
@@ -86,7 +86,7 @@ def test_odometry_keeps_height_covariance_and_twist(maker: Maker) -> None:
     np.testing.assert_array_equal(made.twist.covariance, -covariance)
 
 
-def test_the_last_transform_of_a_frame_counts(maker: Maker) -> None:
+def test_last_transform_of_a_frame_is_used(maker: Maker) -> None:
     def transform(child: str, x: float) -> Any:
         placed = maker.make(
             'geometry_msgs/msg/Transform',
@@ -121,7 +121,7 @@ def test_lists_of_messages_are_copied(maker: Maker) -> None:
     assert all(type(pose) is message_class('geometry_msgs/msg/PoseStamped') for pose in made.poses)
 
 
-def test_another_definition_is_refused() -> None:
+def test_other_message_definition_is_rejected() -> None:
     class Other:
         range = 'far'
 
@@ -129,6 +129,6 @@ def test_another_definition_is_refused() -> None:
         filled(message_class('sensor_msgs/msg/Range')(), Other())
 
 
-def test_a_missing_package_is_named() -> None:
+def test_missing_package_is_named() -> None:
     with pytest.raises(MapperError, match='install ros-jazzy-no-such-msgs'):
         message_class('no_such_msgs/msg/Nothing')

@@ -1,4 +1,4 @@
-"""When a message is due, on a wall clock that the tests turn by hand."""
+"""The times when messages are due, with a wall clock set by the tests."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ START = 1_700_000_000 * SECOND
 
 
 class Wall:
-    """A clock that stands still unless it is set."""
+    """A clock set by the test."""
 
     def __init__(self) -> None:
         self.seconds = 100.0
@@ -26,13 +26,13 @@ def wall() -> Wall:
     return Wall()
 
 
-def test_stamps_are_spread_over_the_wall_clock(wall: Wall) -> None:
+def test_stamps_are_scaled_to_the_wall_clock(wall: Wall) -> None:
     timeline = Timeline(4.0, wall)
     assert [timeline.due('odom', START + i * SECOND) for i in (0, 2, 3, 30)] == [100.0, 100.5, 100.75, 107.5]
     assert timeline.jumps == 0
 
 
-def test_the_time_of_the_bag_runs_up_to_the_message_that_is_waited_for(wall: Wall) -> None:
+def test_bag_time_advances_up_to_the_next_message(wall: Wall) -> None:
     timeline = Timeline(2.0, wall)
     assert timeline.time() == 0
     timeline.due('odom', START)
@@ -43,7 +43,7 @@ def test_the_time_of_the_bag_runs_up_to_the_message_that_is_waited_for(wall: Wal
     assert timeline.time() == START + 3 * SECOND
 
 
-def test_a_latency_delays_nothing(wall: Wall) -> None:
+def test_latency_of_a_topic_delays_no_messages(wall: Wall) -> None:
     timeline = Timeline(1.0, wall)
     timeline.due('odom', START)
     assert timeline.due('odom', START + SECOND) == 101.0
@@ -53,7 +53,7 @@ def test_a_latency_delays_nothing(wall: Wall) -> None:
 
 
 @pytest.mark.parametrize('offset', [-5 * SECOND, -3600 * SECOND, -START, 3600 * SECOND])
-def test_a_sensor_whose_clock_is_wrong_does_not_stop_the_replay(wall: Wall, offset: int) -> None:
+def test_sensor_with_a_wrong_clock_does_not_stop_the_replay(wall: Wall, offset: int) -> None:
     timeline = Timeline(1.0, wall)
     for i in range(100):
         for topic, shift in (('odom', 0), ('sonar', offset)):
@@ -61,7 +61,7 @@ def test_a_sensor_whose_clock_is_wrong_does_not_stop_the_replay(wall: Wall, offs
     assert wall.seconds == pytest.approx(109.9, abs=0.2)
 
 
-def test_a_single_wrong_stamp_does_not_stop_the_replay(wall: Wall) -> None:
+def test_single_wrong_stamp_does_not_stop_the_replay(wall: Wall) -> None:
     timeline = Timeline(1.0, wall)
     for i in range(100):
         wrong = 10 * LONGEST_GAP if i == 50 else 0
@@ -70,7 +70,7 @@ def test_a_single_wrong_stamp_does_not_stop_the_replay(wall: Wall) -> None:
     assert timeline.jumps == 2
 
 
-def test_a_clock_that_was_set_back_is_followed(wall: Wall) -> None:
+def test_replay_follows_a_clock_that_was_set_back(wall: Wall) -> None:
     timeline = Timeline(1.0, wall)
     for run in range(2):
         for i in range(50):
@@ -79,7 +79,7 @@ def test_a_clock_that_was_set_back_is_followed(wall: Wall) -> None:
     assert wall.seconds == pytest.approx(109.8, abs=0.2)
 
 
-def test_lost_time_is_not_made_up_for_in_a_burst(wall: Wall) -> None:
+def test_long_delay_is_not_caught_up(wall: Wall) -> None:
     timeline = Timeline(1.0, wall)
     timeline.due('odom', START)
     wall.seconds += 10
@@ -87,7 +87,7 @@ def test_lost_time_is_not_made_up_for_in_a_burst(wall: Wall) -> None:
     assert timeline.due('odom', START + 2 * SECOND) == 111.0
 
 
-def test_a_small_delay_is_made_up_for(wall: Wall) -> None:
+def test_short_delay_is_caught_up(wall: Wall) -> None:
     timeline = Timeline(1.0, wall)
     timeline.due('odom', START)
     wall.seconds += 1.2

@@ -1,4 +1,4 @@
-"""Where a job works whose results go to a folder."""
+"""The work folder of a job with results in a folder."""
 
 from __future__ import annotations
 
@@ -19,8 +19,10 @@ from forward_grid_mapper.commands.many_workers import beside
         ('..', '../{0}.work'),
     ],
 )
-def test_it_is_beside_the_results(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, output: str, work: str) -> None:
-    """In the folder of the results, what an interrupted job has done would keep it from going on."""
+def test_work_folder_is_beside_the_results(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, output: str, work: str
+) -> None:
+    """In the folder of the results, files of an interrupted job would prevent it from continuing."""
     (tmp_path / 'here').mkdir()
     monkeypatch.chdir(tmp_path / 'here')
     assert beside(Path(output)) == (tmp_path / work.format(tmp_path.name)).resolve()

@@ -1,4 +1,4 @@
-"""Tiles by workers: the maps of one process, whoever is killed; clear errors; large maps in parts."""
+"""Tiles on several workers: the maps equal those of one process, also after kills; errors; large maps in parts."""
 
 from __future__ import annotations
 
@@ -70,7 +70,7 @@ def one_process(drives: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 class Here:
-    """A cluster of this process; it may be interrupted after so many tasks."""
+    """A cluster in this process, which may be interrupted after so many tasks."""
 
     workers, memory, dashboard = 1, 0, ''
 
@@ -136,14 +136,14 @@ def made_here(drives: Path, tmp_path: Path, cluster: Here, turned: bool = False,
 
 @scaled
 @pytest.mark.parametrize('turned', [False, True])
-def test_maps_are_those_of_one_process_in_whatever_order(
+def test_maps_equal_those_of_one_process_in_any_order(
     drives: Path, one_process: Path, tmp_path: Path, turned: bool
 ) -> None:
     assert_same(made_here(drives, tmp_path, Here(turned=turned), turned), one_process)
 
 
 @scaled
-def test_results_are_those_of_one_process_in_all_else(drives: Path, one_process: Path, tmp_path: Path) -> None:
+def test_other_results_equal_those_of_one_process(drives: Path, one_process: Path, tmp_path: Path) -> None:
     folder = made_here(drives, tmp_path, Here())
     missing = {path.name for path in one_process.iterdir()} - {path.name for path in folder.iterdir()}
     assert missing == {'report.html', 'readings.npz'}
@@ -156,21 +156,21 @@ def test_results_are_those_of_one_process_in_all_else(drives: Path, one_process:
         assert {**mine, 'health': 0} == {**row, 'health': 0}
         for kind in ('readings', 'random', 'no_echo', 'missed', 'verdict'):
             assert mine['health'][kind] == row['health'][kind], (name, kind)
-        # what lies beyond a tile's box is not seen, and ranges are counted in bins
+        # readings beyond the box of a tile are not seen, and ranges are counted in bins
         assert mine['health']['short'] == pytest.approx(row['health']['short'], abs=0.02)
         assert mine['health']['same'] == pytest.approx(row['health']['same'], abs=0.1)
         assert mine['health']['common'] == pytest.approx(row['health']['common'], abs=0.3)
 
 
 @scaled
-def test_an_interrupted_job_goes_on_where_it_stood(drives: Path, one_process: Path, tmp_path: Path) -> None:
-    """Interrupted every few tasks, no task but the one of then is done twice."""
+def test_interrupted_job_continues(drives: Path, one_process: Path, tmp_path: Path) -> None:
+    """The job is interrupted every few tasks; only the interrupted task is done twice."""
     rounds = 0
     while True:
         rounds += 1
         done = len([path for path in (tmp_path / 'work').rglob('*') if path.is_file()])
         try:
-            # those that are done only say so
+            # finished tasks only report that they are finished
             folder = made_here(drives, tmp_path, Here(12 * rounds))
             break
         except KeyboardInterrupt:
@@ -180,7 +180,7 @@ def test_an_interrupted_job_goes_on_where_it_stood(drives: Path, one_process: Pa
 
 
 @scaled
-def test_a_task_that_is_run_again_changes_nothing(drives: Path, tmp_path: Path) -> None:
+def test_repeated_task_changes_no_files(drives: Path, tmp_path: Path) -> None:
     from forward_grid_mapper.scale import tile_work
     from forward_grid_mapper.scale.mapping import ScaledMapper
 
@@ -257,9 +257,7 @@ def wait_for(condition: Callable[[], bool], process: subprocess.Popen[bytes]) ->
 
 
 @scaled
-def test_a_killed_worker_and_a_killed_client_cost_only_what_they_were_at(
-    drives: Path, one_process: Path, tmp_path: Path
-) -> None:
+def test_killed_worker_or_client_loses_only_its_current_tasks(drives: Path, one_process: Path, tmp_path: Path) -> None:
     import psutil
 
     work = tmp_path / 'work'
@@ -274,7 +272,7 @@ def test_a_killed_worker_and_a_killed_client_cost_only_what_they_were_at(
     os.kill(workers[0].pid, signal.SIGKILL)
     wait_for(lambda: count('search_0000.npz') > 1, client)
     client.kill()
-    # its workers have the same pipes, and end when they find that it is gone
+    # its workers have the same pipes, and end when they notice that it has ended
     client.communicate(timeout=PATIENCE)
     assert not (tmp_path / 'maps').exists()
     before = {path: path.stat().st_mtime_ns for path in work.glob('tiles/*/search_*.npz')}
@@ -288,8 +286,8 @@ def test_a_killed_worker_and_a_killed_client_cost_only_what_they_were_at(
 
 
 @scaled
-def test_ctrl_c_says_once_what_is_kept(drives: Path, tmp_path: Path) -> None:
-    """A terminal sends it to the workers as well."""
+def test_ctrl_c_prints_one_message_about_kept_files(drives: Path, tmp_path: Path) -> None:
+    """A terminal sends Ctrl-C to the workers as well."""
     work = tmp_path / 'work'
     client = started(drives, '-o', tmp_path / 'maps', '--tiles', TILE, '--workers', 2, '--work', work, '-q', group=True)
     wait_for(lambda: any(work.glob('tiles/*/normals.npz')), client)
@@ -305,7 +303,7 @@ def test_ctrl_c_says_once_what_is_kept(drives: Path, tmp_path: Path) -> None:
 
 
 @scaled
-def test_ctrl_c_while_workers_start_shows_nothing_of_theirs(drives: Path, tmp_path: Path) -> None:
+def test_ctrl_c_while_workers_start_prints_one_message(drives: Path, tmp_path: Path) -> None:
     import psutil
 
     client = started(drives, '-o', tmp_path / 'maps', '--tiles', TILE, '--workers', 2, '-q', group=True)
@@ -339,7 +337,7 @@ def small_disk(tmp_path: Path, full: str) -> Iterator[Path]:
 
 @scaled
 @pytest.mark.parametrize('full', [*SIZES])
-def test_a_disk_that_is_really_full(
+def test_full_disk_is_reported_and_the_job_continues_later(
     drives: Path, one_process: Path, tmp_path: Path, small_disk: Path, full: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     where = {'work': tmp_path / 'work', 'maps': tmp_path / 'maps', full: small_disk / full}
@@ -349,7 +347,7 @@ def test_a_disk_that_is_really_full(
     assert f'{where[full]}' in error and 'the disk is full; free some space' in error
     assert 'the same command continues from there' in error and 'Traceback' not in error
     assert not where['maps'].exists() and not list(small_disk.rglob('.*partial'))
-    # what is there is whole
+    # all existing files are complete
     for path in where['work'].rglob('*.npz'):
         np.load(path).close()
     subprocess.run(['mount', '-o', 'remount,size=100M', str(small_disk)], check=True)
@@ -365,10 +363,10 @@ def hungry(job: Job, number: int) -> dict[str, Any]:
 
 
 @scaled
-def test_a_worker_that_takes_more_than_its_memory(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_worker_above_its_memory_limit_is_reported(monkeypatch: pytest.MonkeyPatch) -> None:
     from forward_grid_mapper.scale import cluster
 
-    # the second try is as good as the fourth
+    # a second try is sufficient
     monkeypatch.setitem(cluster.SETTINGS, 'distributed.scheduler.allowed-failures', 1)
     job = Job(WorkFolder('nowhere'), Parameters(), TILE, versions())
     with (
@@ -379,7 +377,7 @@ def test_a_worker_that_takes_more_than_its_memory(monkeypatch: pytest.MonkeyPatc
 
 
 @scaled
-def test_a_scheduler_that_does_not_answer(
+def test_scheduler_that_does_not_respond_is_reported(
     drives: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     from forward_grid_mapper.scale import cluster
@@ -399,13 +397,13 @@ def refused(job: Job, number: int) -> dict[str, Any]:
 
 
 @scaled
-def test_a_scheduler_that_exists(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_existing_scheduler_is_used(monkeypatch: pytest.MonkeyPatch) -> None:
     from distributed import LocalCluster
 
     from forward_grid_mapper.scale import cluster
 
     job = Job(WorkFolder('nowhere'), Parameters(), TILE, versions())
-    # of processes, as those that users have; one in this process has its event loop in common with the client
+    # in separate processes, as for users; in this process it would share its event loop with the client
     with LocalCluster(
         n_workers=2, threads_per_worker=1, processes=True, memory_limit='1GB', dashboard_address=None
     ) as there:
@@ -415,8 +413,8 @@ def test_a_scheduler_that_exists(monkeypatch: pytest.MonkeyPatch) -> None:
             assert sorted(given.each('twice', doubled, job, range(5), 1)) == [
                 (k, {'twice': 2 * k + 1}) for k in range(5)
             ]
-            for number, told in ((0, 'the disk is broken'), (1, 'the disk is full')):
-                with pytest.raises(OutputError, match=told):
+            for number, expected in ((0, 'the disk is broken'), (1, 'the disk is full')):
+                with pytest.raises(OutputError, match=expected):
                     list(given.each('refused', refused, job, [number]))
         monkeypatch.setattr(cluster, 'versions', lambda: {**versions(), 'numba': '0.1'})
         with pytest.raises(ClusterError, match=r'numba .*, not 0\.1'), cluster.Cluster(1, address, 10):
@@ -424,7 +422,7 @@ def test_a_scheduler_that_exists(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @scaled
-def test_warnings_are_those_of_one_process(tmp_path: Path) -> None:
+def test_warnings_equal_those_of_one_process(tmp_path: Path) -> None:
     drive = campus_drive(0, 1, 900, sonars=front_array())
     middle = drive.odometry[len(drive.odometry) // 2].stamp
 
@@ -435,28 +433,28 @@ def test_warnings_are_those_of_one_process(tmp_path: Path) -> None:
     jumping = dataclasses.replace(drive, odometry=[jumped(message) for message in drive.odometry])
     write_bag(tmp_path / 'drives' / 'drive', jumping, 'mcap', False)
     made_here(tmp_path / 'drives', tmp_path, Here(), max_iterations=1)
-    told = json.loads((tmp_path / 'maps' / 'report.json').read_text())['warnings']
-    assert any(text.startswith('odometry jumps once, by 5.0 m') for text in told)
-    assert any('raise max_iterations' in text for text in told)
+    warnings = json.loads((tmp_path / 'maps' / 'report.json').read_text())['warnings']
+    assert any(text.startswith('odometry jumps once, by 5.0 m') for text in warnings)
+    assert any('raise max_iterations' in text for text in warnings)
 
 
 @scaled
-def test_workers_are_told_what_has_no_effect(drives: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    told: list[str] = []
+def test_options_without_effect_are_reported_with_workers(drives: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    reported: list[str] = []
 
     def with_workers(options: Any, parameters: Any, extrinsics: Any, ignored: list[str], *_: Any) -> int:
-        told.extend(ignored)
+        reported.extend(ignored)
         return 0
 
     monkeypatch.setattr(process_bag, 'with_workers', with_workers)
     assert code_of(drives, '--workers', 2, '--set', 'odometry_noise=2deg') == 0
-    assert told == ['odometry_noise has an effect only with --refine-poses, which is not given']
+    assert reported == ['odometry_noise has an effect only with --refine-poses, which is not given']
 
 
 # ---- errors
 
 
-def test_without_the_extra_it_says_what_to_install(
+def test_missing_extra_is_reported_with_a_remedy(
     drives: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setitem(sys.modules, 'distributed', None)
@@ -467,7 +465,7 @@ def test_without_the_extra_it_says_what_to_install(
 
 @scaled
 @pytest.mark.parametrize(
-    ('options', 'told'),
+    ('options', 'expected'),
     [
         (('--workers', 0), '--workers'),
         (('--workers', 100_000), 'cores; give at most'),
@@ -482,21 +480,21 @@ def test_without_the_extra_it_says_what_to_install(
         (('--work', 'here'), '--work'),
     ],
 )
-def test_options_that_do_not_go_together(
-    drives: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], options: tuple[object, ...], told: str
+def test_incompatible_options_are_rejected(
+    drives: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], options: tuple[object, ...], expected: str
 ) -> None:
     assert code_of(drives, '-o', tmp_path / 'maps', *options) == 1
-    assert told in capsys.readouterr().err
+    assert expected in capsys.readouterr().err
     assert list(tmp_path.iterdir()) == []
 
 
-def test_another_version_is_named() -> None:
+def test_other_version_is_rejected_by_name() -> None:
     check_versions(versions())
     with pytest.raises(ClusterError, match=r'numpy .*, not 0\.1.*install the same'):
         check_versions({**versions(), 'numpy': '0.1'})
 
 
-def test_a_work_folder_holds_one_job(tmp_path: Path) -> None:
+def test_work_folder_belongs_to_one_job(tmp_path: Path) -> None:
     work = WorkFolder(str(tmp_path / 'work'))
     assert not work.begin({'tiles': 5.0, 'of': (1, 2)})
     assert work.begin({'tiles': 5.0, 'of': (1, 2)})
@@ -509,7 +507,7 @@ def test_a_work_folder_holds_one_job(tmp_path: Path) -> None:
     assert [path.name for path in (tmp_path / 'other').iterdir()] == ['file']
 
 
-def test_a_worker_that_outlives_a_job_takes_the_plan_of_the_next(tmp_path: Path) -> None:
+def test_worker_uses_the_plan_of_the_next_job(tmp_path: Path) -> None:
     work = WorkFolder(str(tmp_path))
     for name, width in (('left', 30), ('right', 50)):
         plan = {
@@ -526,10 +524,10 @@ def test_a_worker_that_outlives_a_job_takes_the_plan_of_the_next(tmp_path: Path)
         assert plan_of(work, 5.0) is found
 
 
-@pytest.mark.parametrize(('number', 'told'), [(errno.ENOSPC, 'disk is full'), (errno.EACCES, 'permission')])
-def test_a_file_is_whole_or_not_there(tmp_path: Path, number: int, told: str) -> None:
+@pytest.mark.parametrize(('number', 'expected'), [(errno.ENOSPC, 'disk is full'), (errno.EACCES, 'permission')])
+def test_file_is_complete_or_unchanged(tmp_path: Path, number: int, expected: str) -> None:
     (tmp_path / 'file').write_text('before')
-    with pytest.raises(OutputError, match=told), whole(tmp_path / 'file') as partial:
+    with pytest.raises(OutputError, match=expected), whole(tmp_path / 'file') as partial:
         partial.write_text('half of')
         raise OSError(number, os.strerror(number))
     assert (tmp_path / 'file').read_text() == 'before'
@@ -546,7 +544,7 @@ def test_drives_that_cannot_be_mapped_are_named(drives: Path, tmp_path: Path) ->
 
 
 @scaled
-def test_a_bag_without_static_transforms_uses_those_of_another(drives: Path, tmp_path: Path) -> None:
+def test_bag_without_static_transforms_uses_those_of_another(drives: Path, tmp_path: Path) -> None:
     from forward_grid_mapper.scale.placing import place
 
     drive = dataclasses.replace(campus_drive(3, 1, 900, sonars=front_array()), extrinsics=())
@@ -557,7 +555,7 @@ def test_a_bag_without_static_transforms_uses_those_of_another(drives: Path, tmp
 
 
 @scaled
-def test_the_same_drive_twice_counts_once(drives: Path, one_process: Path, tmp_path: Path) -> None:
+def test_copy_of_a_drive_is_left_out(drives: Path, one_process: Path, tmp_path: Path) -> None:
     copies = tmp_path / 'copies'
     shutil.copytree(drives, copies)
     shutil.copytree(drives / 'drive_1', copies / 'drive_9')

@@ -1,4 +1,4 @@
-"""A campus: its true map, ways that meet no wall, and drives that depend on their number alone."""
+"""A simulated campus: true map, paths that meet no wall, and drives that depend only on their number and the seed."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from forward_grid_mapper.simulation.world import building_world, cells_along
 
 
 @pytest.mark.parametrize('buildings', [1, 2, 5])
-def test_the_true_map_holds_every_building(buildings: int) -> None:
+def test_true_map_contains_each_building(buildings: int) -> None:
     world, one = campus_world(buildings), building_world(entrance=True)
     drawn = np.zeros(world.grid.shape, bool)
     for segment in world.segments:
@@ -28,7 +28,7 @@ def test_the_true_map_holds_every_building(buildings: int) -> None:
 
 
 @pytest.mark.parametrize('first', [0, 2, 4])
-def test_ways_lead_through_buildings_and_meet_no_wall(first: int) -> None:
+def test_paths_lead_through_buildings_and_meet_no_wall(first: int) -> None:
     world = campus_world(5)
     path = campus_path(3000.0, first, 5, np.random.default_rng(first))
     steps = np.hypot(*np.diff(path, axis=0).T)
@@ -41,7 +41,7 @@ def test_ways_lead_through_buildings_and_meet_no_wall(first: int) -> None:
     assert (world.reference[rows, columns] == 0).all()
 
 
-def test_a_drive_depends_on_its_number_and_the_seed_alone() -> None:
+def test_drive_depends_only_on_its_number_and_the_seed() -> None:
     def made(number: int, seed: int = 0):
         return campus_drive(number, 2, 400, seed=seed, sonars=front_array())
 

@@ -20,12 +20,12 @@ def straight(metres: float) -> np.ndarray:
     return np.column_stack([x, np.zeros_like(x), np.zeros_like(x)])
 
 
-def test_no_drift_changes_nothing() -> None:
+def test_odometry_without_drift_is_unchanged() -> None:
     poses = np.cumsum(np.random.default_rng(0).normal(0, 0.05, (200, 3)), axis=0)
     assert drifted(poses, NONE, 0) == pytest.approx(poses)
 
 
-def test_noise_grows_with_the_root_of_the_way() -> None:
+def test_yaw_error_grows_with_the_square_root_of_the_distance() -> None:
     level = Drift(math.radians(2.0), 0.0, 0.0, 0.0, 0.0)
     ends = [drifted(straight(way), level, seed)[-1, 2] for way in (4.0, 36.0) for seed in range(150)]
     short, long = np.std(ends[:150]), np.std(ends[150:])
@@ -33,7 +33,7 @@ def test_noise_grows_with_the_root_of_the_way() -> None:
     assert long == pytest.approx(math.radians(12.0), rel=0.2)
 
 
-def test_bias_and_scale_are_the_same_over_a_drive() -> None:
+def test_bias_and_scale_are_constant_over_a_drive() -> None:
     level = Drift(0.0, 0.0, 0.02, 0.05, 0.0)
     poses = drifted(straight(10.0), level, 3)
     turns = np.diff(poses[:, 2])
@@ -43,7 +43,7 @@ def test_bias_and_scale_are_the_same_over_a_drive() -> None:
     assert steps.mean() != pytest.approx(0.02, rel=1e-3)
 
 
-def test_readings_go_along_with_the_odometry() -> None:
+def test_readings_of_a_drifted_drive_keep_their_pose_on_the_robot() -> None:
     exact = door_drive()
     bent = with_drift(exact, LEVELS['high'], 1)
     assert [m.stamp for m in bent.odometry] == [m.stamp for m in exact.odometry]

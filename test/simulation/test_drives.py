@@ -1,4 +1,4 @@
-"""Drives: what is recorded, and that it is consistent."""
+"""Simulated drives: the recorded messages, and their consistency."""
 
 from __future__ import annotations
 
@@ -48,13 +48,13 @@ def test_messages_and_readings_agree(tour):
     assert 2 * readings.half_angle[0] == pytest.approx(tour.ranges[0].field_of_view)
 
 
-def test_interpolated_odometry_places_every_reading_exactly(tour):
+def test_interpolated_odometry_places_each_reading_exactly(tour):
     stamps = np.array([m.stamp for m in tour.odometry])
     assert stamps[0] == START < tour.ranges[0].stamp
     assert stamps[-1] > tour.ranges[-1].stamp
     assert 0 < np.diff(stamps).min() and np.diff(stamps).max() <= 20_000_000
     assert {(m.frame_id, m.child_frame_id) for m in tour.odometry} == {('odom', 'base_link')}
-    # without the messages that coincide with a sweep, as if both came from clocks of their own
+    # without the messages that coincide with a sweep, as if odometry and sonars had independent clocks
     other = ~np.isin(stamps, tour.readings.stamp)
     poses = np.array([m.pose for m in tour.odometry])[other]
     seconds, at = (stamps[other] - START) / 1e9, (tour.readings.stamp[::8] - START) / 1e9
@@ -85,12 +85,12 @@ def test_door_is_seen_by_n_sweeps(n):
     assert (beside <= 0.1 + 1e-9).sum() == n
     assert not np.any((beside > 0.1 + 1e-9) & (beside < 1.0))
     assert np.diff(recording.readings.stamp[::24]).min(initial=10**9) > 0
-    # the sonars that look squarely through the door reach the room's back wall
+    # the sonars that look straight through the door reach the back wall of the room
     readings = recording.readings
     square = (np.abs(readings.x - door.x) < 0.11) & (np.abs(np.sin(readings.yaw) - 1.0) < 1e-6)
     assert square.sum() == n
     assert readings.z[square] == pytest.approx(8.45 - readings.y[square], rel=2e-5)
-    # hardly any other reading does
+    # hardly any other readings do
     into = readings.y + readings.z * np.sin(readings.yaw) > door.y + 0.5
     assert (into & readings.echo & ~square).sum() <= 2 + n
 
@@ -104,7 +104,7 @@ def test_corridor_drive_has_twelve_thousand_readings_and_a_person():
     assert np.median(alone.readings.z[12::24]) > 3.0
 
 
-def test_corridor_passes_go_to_and_fro():
+def test_corridor_passes_alternate_in_direction():
     recording = corridor_drive(passes=2)
     assert len(recording.readings) == 24_000
     assert recording.robot[:500, :2] == pytest.approx(recording.robot[:499:-1, :2], abs=1e-6)
@@ -122,19 +122,19 @@ def test_building_has_16_wide_sonars_and_laps_that_differ():
     assert 0.0 < np.median(apart) < apart.max() < 0.3
 
 
-def test_same_seed_same_recording():
+def test_recording_depends_only_on_the_seed():
     first, again, other = corridor_drive(7), corridor_drive(7), corridor_drive(8)
     assert first.ranges == again.ranges
     assert first.odometry == again.odometry
     assert first.ranges != other.ranges
 
 
-def test_standing_waypoints_are_refused():
+def test_equal_waypoints_are_rejected():
     with pytest.raises(ValueError, match='waypoints'):
         drive_sweeps(door_world(), np.array([[3.0, 3.75], [3.0, 3.75]]), np.zeros(1))
 
 
-def test_a_person_passes_the_robot_in_the_world_of_two_doors_on_either_side() -> None:
+def test_person_passes_the_robot_in_the_world_with_four_doors() -> None:
     recording = passing_drive(noise=NOISE_FREE)
     assert recording.world.grid.shape == (120, 114)
     sides = [door.y > recording.robot[0, 1] for door in recording.world.doors]

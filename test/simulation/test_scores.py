@@ -1,4 +1,4 @@
-"""Scores: perfect, empty, shifted, dotted and closed maps; maps on other lattices."""
+"""Scores of perfect, empty, shifted, dotted and closed maps, and of maps on other lattices."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def door():
     return recording.world, visible_surface(recording.world, recording.readings)
 
 
-def test_perfect_map(case):
+def test_perfect_map_has_perfect_scores(case):
     world, visible = case
     scores = score_map(world.reference, world.grid, world, visible)
     assert (scores.precision, scores.recall, scores.f1, scores.rough_coverage) == (1.0, 1.0, 1.0, 1.0)
@@ -37,7 +37,7 @@ def test_perfect_map(case):
 
 
 @pytest.mark.parametrize('value', [-1, 0])
-def test_map_without_walls(case, value):
+def test_map_without_walls_scores_zero(case, value):
     world, visible = case
     scores = score_map(np.full(world.grid.shape, value, np.int8), world.grid, world, visible)
     assert (scores.precision, scores.recall, scores.f1, scores.false_dots) == (0.0, 0.0, 0.0, 0)
@@ -45,7 +45,7 @@ def test_map_without_walls(case, value):
     assert scores.longest_gap > 20
 
 
-def test_empty_grid(door):
+def test_empty_grid_scores_zero(door):
     world, visible = door
     scores = score_map(np.zeros((0, 0), np.int8), Grid(0.1, 0, 0, 0, 0), world, visible)
     assert scores.f1 == 0.0
@@ -53,7 +53,7 @@ def test_empty_grid(door):
 
 
 @pytest.mark.parametrize(('change', 'width', 'open_'), [(1, 0.0, 0), (-1, 0.0, 0)])
-def test_closed_or_unseen_door(door, change, width, open_):
+def test_closed_or_unknown_door_is_not_open(door, change, width, open_):
     world, visible = door
     ml = world.reference.copy()
     ml[48, 58:64] = change
@@ -63,7 +63,7 @@ def test_closed_or_unseen_door(door, change, width, open_):
 
 
 @pytest.mark.parametrize(('first', 'last', 'width', 'open_'), [(58, 59, 0.4, 1), (60, 60, 0.3, 1), (60, 61, 0.2, 0)])
-def test_half_closed_door(door, first, last, width, open_):
+def test_half_closed_door_has_the_remaining_width(door, first, last, width, open_):
     world, visible = door
     ml = world.reference.copy()
     ml[50, first : last + 1] = 1
@@ -72,7 +72,7 @@ def test_half_closed_door(door, first, last, width, open_):
     assert scores.doors_open == open_
 
 
-def test_no_door_is_wider_than_it_is(door):
+def test_door_width_is_at_most_the_true_width(door):
     world, visible = door
     ml = world.reference.copy()
     ml[46:51, 50:70] = 0
@@ -80,7 +80,7 @@ def test_no_door_is_wider_than_it_is(door):
 
 
 @pytest.mark.parametrize(('cells', 'exact'), [(1, True), (2, False)])
-def test_one_cell_off_is_near_enough(door, cells, exact):
+def test_map_shifted_by_one_cell_has_perfect_scores(door, cells, exact):
     world, visible = door
     grid = replace(world.grid, column=cells, row=cells)
     scores = score_map(world.reference, grid, world, visible)
@@ -88,7 +88,7 @@ def test_one_cell_off_is_near_enough(door, cells, exact):
     assert (scores.false_dots == 0) == exact
 
 
-def test_dots_in_free_space_and_behind_walls(door):
+def test_false_dots_count_only_away_from_walls(door):
     world, visible = door
     ml = world.reference.copy()
     ml[37, 30] = ml[70, 60] = 1  # free space
@@ -100,7 +100,7 @@ def test_dots_in_free_space_and_behind_walls(door):
     assert scores.precision == pytest.approx(walls / (walls + 4))
 
 
-def test_dotted_wall(door):
+def test_dotted_wall_has_full_recall_and_low_column_coverage(door):
     world, visible = door
     ml = world.reference.copy()
     ml[26, 7:115] = 0
@@ -113,7 +113,7 @@ def test_dotted_wall(door):
     assert score_map(ml, world.grid, world, visible).longest_gap > 9
 
 
-def test_smooth_and_rough_are_told_apart():
+def test_smooth_and_rough_walls_have_separate_scores():
     recording = corridor_drive()
     world = recording.world
     visible = visible_surface(world, recording.readings)
@@ -124,7 +124,7 @@ def test_smooth_and_rough_are_told_apart():
     assert scores.recall == pytest.approx(1 - 178 / visible.sum())
 
 
-def test_grids_cut_from_the_same_lattice(door):
+def test_larger_and_smaller_grids_of_the_same_lattice(door):
     world, visible = door
     inner = Grid(0.1, 4, 20, 115, 70)
     scores = score_map(world.reference[world.grid.window(inner)], inner, world, visible)
@@ -140,11 +140,11 @@ def test_grids_cut_from_the_same_lattice(door):
 
 
 @pytest.mark.parametrize('factor', [2, 4])
-def test_finer_maps(door, factor):
+def test_finer_map_has_perfect_scores(door, factor):
     world, visible = door
     grid = Grid(0.1 / factor, 0, 0, world.grid.width * factor, world.grid.height * factor)
     fine = np.kron(world.reference, np.ones((factor, factor), np.int8))
-    # a wall one fine cell thick counts as well
+    # a wall of one fine cell is found as well
     thin = fine.copy()
     thin[26 * factor : 27 * factor - 1] = np.minimum(fine[26 * factor : 27 * factor - 1], 0)
     for ml in (fine, thin):
@@ -152,7 +152,7 @@ def test_finer_maps(door, factor):
         assert (scores.f1, scores.false_dots, scores.door_widths) == (1.0, 0, (0.6,))
 
 
-def test_coarser_map(door):
+def test_coarser_map_has_perfect_scores(door):
     world, visible = door
     grid = Grid(0.2, 0, 0, 61, 54)
     padded = np.pad(world.reference, ((0, 1), (0, 0)), constant_values=-1)
@@ -162,11 +162,11 @@ def test_coarser_map(door):
     assert scores.doors_open == 1
 
 
-def test_visible_surface_ends_with_the_range_and_at_walls(door):
+def test_visible_surface_ends_at_the_largest_range_and_at_walls(door):
     world, visible = door
     assert visible[26, 7:115].all()
     assert not np.any(visible & (world.reference != 1))
-    # a single reading, square to the wall: ± 7.5° of it
+    # a single reading, perpendicular to the wall: ± 7.5° of it
     recording = door_drive(0)
     wall = recording.readings.select(np.array([6]))
     seen = visible_surface(world, wall)
@@ -179,24 +179,24 @@ def test_visible_surface_ends_with_the_range_and_at_walls(door):
     assert not visible_surface(world, short).any()
 
 
-def test_visible_surface_of_first_echoes(door):
+def test_visible_surface_of_first_echoes_is_smaller(door):
     world, visible = door
     readings = door_drive(3).readings
     near = visible_surface(world, readings, depth=0.2)
     assert not np.any(near & ~visible)
-    # past the jambs some cones look at the room's side walls, but the jambs answer first
+    # past the jambs, some cones contain the side walls of the room, but the echoes of the jambs come first
     sides = np.zeros_like(near)
     sides[50:84, [38, 83]] = True
     assert (near & sides).sum() < 0.5 * (visible & sides).sum()
     assert near[26, 7:115].all()
 
 
-def test_threshold():
+def test_threshold_of_probabilities():
     p = np.array([0.0, 0.34, 0.36, 0.5, 0.64, 0.66, 1.0, np.nan], np.float32)
     assert threshold(p).tolist() == [0, 0, -1, -1, -1, 1, 1, -1]
 
 
-def test_every_world_scores_itself_perfect():
+def test_reference_of_each_world_has_perfect_scores():
     for make in WORLDS.values():
         world = make()
         scores = score_map(world.reference, world.grid, world, world.reference == 1)

@@ -1,4 +1,4 @@
-"""Sonars: analytic distances, cones, noise, smooth walls, people, mirrored worlds."""
+"""Simulated sonars: analytic distances, cones, noise, smooth walls, people, and mirrored worlds."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ def measure_at(world, x, y, yaw, sonars=ONE, noise=NOISE_FREE, seed=0, people=No
     return measure(world, sonars, robot, noise, np.random.default_rng(seed), people)
 
 
-def test_cast_meets_the_nearest_wall():
+def test_cast_returns_the_nearest_wall():
     segments = np.array([[2.0, -1.0, 2.0, 1.0], [3.0, -5.0, 3.0, 5.0], [-9.0, -1.0, -9.0, 1.0]])
     angles = np.array([[0.0, math.pi / 4, math.pi / 2, math.pi]])
     distance, hit = cast(np.zeros((1, 2)), angles, segments, 5.0)
@@ -47,7 +47,7 @@ def test_cast_meets_the_nearest_wall():
     assert hit[0].tolist() == [0, 1, NOTHING, NOTHING]
 
 
-def test_cast_agrees_with_one_ray_at_a_time():
+def test_cast_of_many_rays_equals_single_rays():
     rng = np.random.default_rng(1)
     segments, origins = rng.uniform(0, 10, (20, 4)), rng.uniform(0, 10, (3000, 2))
     angles = rng.uniform(-4, 4, (3000, 5))
@@ -58,13 +58,13 @@ def test_cast_agrees_with_one_ray_at_a_time():
         assert np.array_equal(alone_hit[0], hit[n])
 
 
-def test_discs():
+def test_distance_to_discs():
     centers = np.array([[2.0, 0.0], [2.0, 0.5], [-2.0, 0.0], [np.nan, np.nan]])
     distance = cast_discs(np.zeros((4, 2)), np.zeros((4, 1)), centers, 0.25)
     assert distance[:, 0] == pytest.approx([1.75, math.inf, math.inf, math.inf])
 
 
-def test_blocked():
+def test_path_through_a_wall_is_blocked():
     wall = np.array([[1.0, -1.0, 1.0, 1.0]])
     assert blocked(np.array([[0.0, 0.0], [2.0, 0.0]]), wall)
     assert not blocked(np.array([[0.0, 0.0], [0.9, 0.0], [0.9, 3.0], [3.0, 3.0]]), wall)
@@ -77,7 +77,7 @@ def test_range_is_that_of_the_nearest_point_in_the_cone(degrees, nearest):
     assert z[0, 0] == pytest.approx(2.95 / math.cos(math.radians(nearest)), rel=2e-5)
 
 
-def test_wider_cones_see_oblique_walls_earlier():
+def test_wider_cone_has_a_shorter_range_to_an_oblique_wall():
     angles = [5.0, 15.0, 30.0]
     ranges = [
         measure_at(room(), 10.0, 17.0, math.radians(60.0), replace(ONE, field_of_view=math.radians(angle)))[0, 0]
@@ -86,7 +86,7 @@ def test_wider_cones_see_oblique_walls_earlier():
     assert ranges == pytest.approx([2.95 / math.cos(math.radians(30.0 - a / 2)) for a in angles], rel=2e-5)
 
 
-def test_into_a_corner():
+def test_range_into_a_corner():
     # both walls are 1.95 m away; at 45° the edges of the cone meet them first
     z = measure_at(room(), 18.0, 18.0, math.radians(45.0))
     assert z[0, 0] == pytest.approx(1.95 / math.cos(math.radians(37.5)), rel=2e-5)
@@ -101,7 +101,7 @@ def test_range_ends_at_the_centre_of_the_walls_cell():
     assert measure_at(world, x, y, math.pi / 2)[0, 0] == pytest.approx(centre - y, rel=2e-5)
 
 
-def test_out_of_reach_is_no_echo_and_too_near_is_min_range():
+def test_wall_out_of_range_is_no_echo_and_too_near_is_min_range():
     assert measure_at(room(), 10.0, 10.0, 0.0)[0, 0] == math.inf
     assert measure_at(room(), 19.9, 10.0, 0.0)[0, 0] == ONE.min_range
 
@@ -122,7 +122,7 @@ def test_noise_statistics():
     assert np.histogram(random, 4, (0.1, 6.0))[0].min() > 500
 
 
-def test_same_seed_same_ranges():
+def test_ranges_depend_only_on_the_seed():
     world = WORLDS['door']()
     robot = np.column_stack([np.linspace(1.5, 10.5, 20), np.full(20, 3.75), np.zeros(20)])
     first, again, other = (measure(world, sonar_ring(), robot, NOISY, np.random.default_rng(s)) for s in (3, 3, 4))
@@ -130,26 +130,26 @@ def test_same_seed_same_ranges():
     assert not np.array_equal(first, other)
 
 
-def test_smooth_wall_echoes_near_its_normal_only():
+def test_smooth_wall_returns_echoes_only_near_its_normal():
     world = room(smooth=True)
     yaws = np.radians(np.repeat([90.0, 116.0, 120.0, 135.0], 4000))
     z = measure_at(world, np.full(len(yaws), 10.0), np.full(len(yaws), 17.0), yaws).reshape(4, -1)
     assert z[0] == pytest.approx(2.95, rel=2e-5)
-    # the rays of this cone between 18.5° and 20° from the normal come back
+    # rays of this cone between 18.5° and 20° from the normal return an echo
     assert np.all((z[1] > 2.95 / math.cos(math.radians(18.4))) & (z[1] < 2.95 / math.cos(math.radians(20.0))))
-    # at 10 m from any other wall the mirrored sound dies away
+    # mirrored sound meets no other wall within 10 m
     assert np.all(np.isinf(z[2:]))
 
 
-def test_smooth_wall_ghosts():
-    # at 45° the mirrored axis goes on to the right wall, which is rough: sound comes back from there
+def test_smooth_wall_mirrors_echoes_of_other_walls():
+    # at 45° the mirrored axis meets the right wall, which is rough and returns an echo
     z = measure_at(room(smooth=True), np.full(8000, 17.0), np.full(8000, 18.5), np.full(8000, math.radians(45.0)))[:, 0]
     ghost = np.isfinite(z)
     assert ghost.mean() == pytest.approx(GHOST_SHARE, abs=0.02)
     assert z[ghost] == pytest.approx(2.95 * math.sqrt(2.0), rel=1e-5)
 
 
-def test_person_hides_the_wall_but_not_itself():
+def test_person_occludes_the_wall():
     people = np.array([[18.0, 10.0], [np.nan, np.nan]])
     z = measure_at(room(), np.array([17.0, 17.0]), np.array([10.0, 10.0]), np.zeros(2), people=people)
     assert z[:, 0] == pytest.approx([0.75, 2.95], rel=2e-5)
@@ -167,7 +167,7 @@ def test_mirrored_world_gives_mirrored_ranges(name):
     assert other == pytest.approx(ranges[:, -np.arange(24) % 24])
 
 
-def test_arrays():
+def test_poses_and_names_of_sonar_arrays():
     ring, front = sonar_ring(16, radius=0.3), front_array()
     assert ring.names[:2] == ('sonar_00', 'sonar_01')
     name, pose = ring.extrinsics[4]

@@ -1,4 +1,4 @@
-"""Worlds: layout, reference maps, and the absence of a half-cell bias."""
+"""Simulated worlds: layout, reference maps, and no bias of half a cell."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from forward_grid_mapper.simulation.world import (
 
 
 @pytest.mark.parametrize('name', WORLDS)
-def test_reference_is_consistent(name):
+def test_reference_map_is_consistent_with_the_walls(name):
     world = WORLDS[name]()
     assert world.name == name
     assert world.reference.shape == world.grid.shape == world.smooth_cells.shape
@@ -30,14 +30,14 @@ def test_reference_is_consistent(name):
         drawn[cells_along(segment, world.grid)] = True
     assert np.array_equal(drawn, world.reference == 1)
     assert not np.any(world.smooth_cells & ~drawn)
-    # free space is closed: nowhere does it touch unknown space or the border
+    # free space is closed: it touches neither unknown space nor the border
     free = np.pad(world.reference, 1, constant_values=-1)
     for axis in (0, 1):
         for step in (-1, 1):
             assert not np.any((free == 0) & (np.roll(free, step, axis) == -1))
 
 
-def test_sizes_and_doors_of_the_papers_worlds():
+def test_sizes_and_doors_of_the_worlds_of_the_paper():
     door, corridor = door_world(), corridor_world()
     assert (door.grid.width, door.grid.height) == (122, 107)
     assert [d.width for d in door.doors] == [0.6]
@@ -73,7 +73,7 @@ def test_walls_run_along_cell_centres(name):
         assert across - np.floor(across) == pytest.approx(0.5)
 
 
-def test_slanting_wall_closes_off_its_corner():
+def test_space_behind_an_oblique_wall_is_unknown():
     world = WORLDS['rooms']()
     assert world.reference[70, 9] == -1
     assert world.reference[63, 16] == 1
@@ -90,7 +90,7 @@ def test_building_is_40_by_16_metres_and_its_tour_enters_every_room():
         legs = np.stack([tour[:-1], tour[1:]], axis=1)
         through = (legs[..., across].min(axis=1) < side) & (legs[..., across].max(axis=1) > side)
         assert (np.abs(legs[..., along] - at).max(axis=1)[through] < 0.11).sum() == 2
-    # sonars 0.25 m from the centre of a robot that is 5 cm off pass everything
+    # sonars 0.25 m from the centre of the robot pass everything even if the robot is 5 cm off
     x, y = world.grid.centers()
     rows, columns = np.nonzero(world.reference == 1)
     for start, end in itertools.pairwise(tour):
@@ -99,14 +99,14 @@ def test_building_is_40_by_16_metres_and_its_tour_enters_every_room():
         assert apart.min() > 0.3
 
 
-def test_cells_along_keep_their_order():
+def test_cells_along_a_segment_keep_their_order():
     grid = WORLDS['rooms']().grid
     rows, columns = cells_along(np.array([0.55, 0.25, 0.15, 0.25]), grid)
     assert rows.tolist() == [2] * 5
     assert columns.tolist() == [5, 4, 3, 2, 1]
 
 
-def test_smooth_stretch_and_door_split_a_wall():
+def test_smooth_part_and_door_split_a_wall():
     plan = Floorplan('plan', 20, 10)
     plan.box((0, 0), (19, 9))
     plan.wall('x', 5, (0, 19), doors=((3, 5),), smooth=(10, 14))

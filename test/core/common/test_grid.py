@@ -1,4 +1,4 @@
-"""Grids: one lattice each, and nothing that is no grid."""
+"""`Grid`: validation, cells of points, unions, windows and boxes of cones."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from forward_grid_mapper.core.common.grid import UNKNOWN, Grid, cone_boxes, part
 FINE, COARSE = Grid(0.05, 0, 0, 8, 6), Grid(0.1, 0, 0, 4, 3)
 
 
-def test_grids_of_two_resolutions_are_never_joined() -> None:
+def test_union_of_two_resolutions_is_rejected() -> None:
     values = np.zeros(FINE.shape, np.int8)
     empty = Grid(0.1, 0, 0, 0, 0)
     for join in (
@@ -27,20 +27,20 @@ def test_grids_of_two_resolutions_are_never_joined() -> None:
 
 
 @pytest.mark.parametrize('resolution', [0.0, -0.1, math.nan, math.inf, '0.1', None])
-def test_the_resolution_is_a_length(resolution: float) -> None:
+def test_resolution_that_is_not_positive_and_finite_is_rejected(resolution: float) -> None:
     with pytest.raises(ValueError, match='resolution'):
         Grid(resolution, 0, 0, 1, 1)
 
 
 @pytest.mark.parametrize('name', ['column', 'row', 'width', 'height'])
 @pytest.mark.parametrize('value', [1.0, math.nan, '1', None, True])
-def test_cells_are_counted_in_whole_numbers(name: str, value: object) -> None:
+def test_grid_field_that_is_not_an_integer_is_rejected(name: str, value: object) -> None:
     fields = {'column': 0, 'row': 0, 'width': 1, 'height': 1, name: value}
     with pytest.raises(ValueError, match=name):
         Grid(0.1, **fields)
 
 
-def test_sizes_are_not_negative_but_places_may_be() -> None:
+def test_negative_size_is_rejected_and_negative_position_is_not() -> None:
     with pytest.raises(ValueError, match='width -1'):
         Grid(0.1, 0, 0, -1, 1)
     assert Grid(0.1, np.int64(-3), -4, np.int32(2), 0).size == 0
@@ -50,7 +50,7 @@ PLACE = Grid(0.5, -3, 4, 5, 2)
 """From (-1.5, 2) to (1, 3) metres."""
 
 
-def test_where_a_grid_lies() -> None:
+def test_origin_extent_and_cell_centres_of_a_grid() -> None:
     assert PLACE.origin == (-1.5, 2.0)
     assert PLACE.extent == (-1.5, 1.0, 2.0, 3.0)
     assert (PLACE.shape, PLACE.size) == ((2, 5), 10)
@@ -60,7 +60,7 @@ def test_where_a_grid_lies() -> None:
     assert y.tolist() == [2.25, 2.75]
 
 
-def test_a_point_belongs_to_the_cell_above_and_right_of_a_corner() -> None:
+def test_point_on_a_corner_belongs_to_the_cell_above_and_right() -> None:
     rows, columns = PLACE.cells_of(np.array([-1.5, -1.6, 0.9, 1.0, 0.0]), np.array([2.0, 1.9, 2.9, 3.0, 2.6]))
     assert (rows.dtype, columns.dtype) == (np.int64, np.int64)
     assert rows.tolist() == [0, -1, 1, 2, 1]
@@ -70,14 +70,14 @@ def test_a_point_belongs_to_the_cell_above_and_right_of_a_corner() -> None:
     assert columns[:, 0].tolist() == [0, 1, 2, 3, 4] and rows[0].tolist() == [0, 1]
 
 
-def test_grids_are_values() -> None:
+def test_grids_are_immutable_and_hashable() -> None:
     with pytest.raises(AttributeError):
         PLACE.row = 3
     assert {PLACE: 1}[Grid(0.5, -3, 4, 5, 2)] == 1
 
 
 @pytest.mark.parametrize('seed', range(20))
-def test_a_union_is_the_smallest_that_holds_both(seed: int) -> None:
+def test_union_is_the_smallest_grid_that_contains_both(seed: int) -> None:
     rng = np.random.default_rng(seed)
     one, other = (Grid(0.1, *rng.integers(-9, 9, 2).tolist(), *rng.integers(1, 9, 2).tolist()) for _ in range(2))
     both = {(grid.row + r, grid.column + c) for grid in (one, other) for r, c in np.ndindex(grid.shape)}
@@ -93,7 +93,7 @@ def test_a_union_is_the_smallest_that_holds_both(seed: int) -> None:
         assert (whole.row + window[0].start, whole.column + window[1].start) == (grid.row, grid.column)
 
 
-def test_an_empty_grid_adds_nothing() -> None:
+def test_union_with_an_empty_grid_is_the_other_grid() -> None:
     empty, line = Grid(0.5, 90, 90, 0, 0), Grid(0.5, 90, 90, 3, 0)
     assert PLACE.union(empty) == PLACE.union(line) == line.union(PLACE) == PLACE
     assert empty.union(line) == line
@@ -102,17 +102,17 @@ def test_an_empty_grid_adds_nothing() -> None:
 @pytest.mark.parametrize(
     ('column', 'row', 'width', 'height'), [(-4, 4, 1, 1), (-3, 3, 1, 1), (1, 4, 2, 1), (1, 5, 1, 2)]
 )
-def test_what_sticks_out_is_not_inside(column: int, row: int, width: int, height: int) -> None:
+def test_window_of_a_grid_that_is_not_inside_is_rejected(column: int, row: int, width: int, height: int) -> None:
     with pytest.raises(ValueError, match='not inside'):
         PLACE.window(Grid(0.5, column, row, width, height))
 
 
-def test_the_whole_and_its_last_cell_are_inside() -> None:
+def test_window_of_the_whole_grid_and_of_its_last_cell() -> None:
     assert PLACE.window(PLACE) == (slice(0, 2), slice(0, 5))
     assert PLACE.window(Grid(0.5, 1, 5, 1, 1)) == (slice(1, 2), slice(4, 5))
 
 
-def test_the_grid_that_covers_a_box_has_the_cells_it_touches() -> None:
+def test_grid_that_covers_a_box_has_the_cells_that_it_touches() -> None:
     assert Grid.covering((-1.3, 0.7, 2.1, 2.4), 0.5) == Grid(0.5, -3, 4, 5, 1)
     assert Grid.covering((-1.3, 0.7, 2.1, 2.6), 0.5) == PLACE
     assert Grid.covering((0.0, 0.0, 0.0, 0.0), 0.5) == Grid(0.5, 0, 0, 1, 1)
@@ -120,7 +120,7 @@ def test_the_grid_that_covers_a_box_has_the_cells_it_touches() -> None:
 
 
 @pytest.mark.parametrize('seed', range(8))
-def test_boxes_of_sectors_are_those_of_their_points(seed: int) -> None:
+def test_box_of_a_sector_is_that_of_its_points(seed: int) -> None:
     rng = np.random.default_rng(seed)
     count = 40
     x, y, reach = rng.uniform(-5, 5, count), rng.uniform(-5, 5, count), rng.uniform(0.1, 4, count)
@@ -140,7 +140,7 @@ def test_boxes_of_sectors_are_those_of_their_points(seed: int) -> None:
     assert (box[[1, 3]] >= np.array(expected)[[1, 3]] - 1e-12).all()
 
 
-def test_boxes_reach_as_far_as_an_axis() -> None:
+def test_box_of_a_cone_around_an_axis_direction_has_the_full_range() -> None:
     quarter = math.pi / 2
     for k, (side, sign) in enumerate(((1, 1), (3, 1), (0, -1), (2, -1))):
         for yaw in (k * quarter, k * quarter - 4 * quarter, k * quarter + 0.2):
@@ -148,14 +148,14 @@ def test_boxes_reach_as_far_as_an_axis() -> None:
             assert box[side] == (1.0 if side < 2 else 2.0) + sign * 3.0
 
 
-def test_windows_are_united() -> None:
+def test_union_of_windows() -> None:
     assert united() is None
     assert united(None, None) is None
     assert united((1, 2, 3, 4), None) == (1, 2, 3, 4)
     assert united((1, 2, 3, 9), (0, 1, 5, 6), None, (4, 7, 4, 5)) == (0, 7, 3, 9)
 
 
-def test_the_rest_of_a_part_is_unknown() -> None:
+def test_part_beyond_the_grid_is_unknown_and_a_copy() -> None:
     assert UNKNOWN == -1
     values = np.arange(10, dtype=np.int8).reshape(PLACE.shape)
     part = part_of(PLACE, values, Grid(0.5, 0, 5, 3, 2))

@@ -1,4 +1,4 @@
-"""The parameter table holds itself to its own ranges."""
+"""The parameter table: ranges, defaults, names of earlier versions, and the constants that are no parameters."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from forward_grid_mapper.core.common.parameters import CONSTANTS, TABLE, Paramet
 
 
 @pytest.mark.parametrize('row', TABLE, ids=lambda row: row.name)
-def test_rows_are_complete_and_defaults_admitted(row) -> None:
+def test_rows_have_help_and_accept_their_default_but_no_bad_values(row) -> None:
     assert row.help.endswith('.')
     assert row.check(row.default) == row.default
     if row.type in (int, float):
@@ -26,7 +26,7 @@ def test_rows_are_complete_and_defaults_admitted(row) -> None:
             row.check('nonsense')
 
 
-def test_flat_values_go_there_and_back() -> None:
+def test_parameters_survive_a_round_trip_through_flat_values() -> None:
     changed = Parameters.from_flat({'p_hit': 0.5, 'resolution': 1, 'online': False})
     assert changed.model.p_hit == 0.5
     assert changed.grid.resolution == 1.0
@@ -34,20 +34,20 @@ def test_flat_values_go_there_and_back() -> None:
     assert Parameters.from_flat({}, base=changed) == changed
 
 
-def test_unknown_names_get_a_hint() -> None:
+def test_unknown_parameter_name_is_rejected_with_a_similar_name() -> None:
     with pytest.raises(ParameterError, match='p_hit'):
         find('phit')
     with pytest.raises(ParameterError, match='resolution'):
         Parameters.from_flat({'zzz': 1})
 
 
-def test_causes_must_leave_something_for_the_map() -> None:
+def test_p_rand_and_p_lost_that_sum_up_to_more_than_one_are_rejected() -> None:
     with pytest.raises(ParameterError, match='p_rand'):
         Parameters.from_flat({'p_rand': 0.7, 'p_lost': 0.5})
 
 
 @pytest.mark.parametrize('name', DEPRECATED)
-def test_names_of_the_version_before_are_left_out_with_a_warning(name: str, caplog: pytest.LogCaptureFixture) -> None:
+def test_removed_parameter_is_ignored_with_a_warning(name: str, caplog: pytest.LogCaptureFixture) -> None:
     assert name not in {row.name for row in TABLE}
     base = Parameters.from_flat({'p_hit': 0.5})
     assert Parameters.from_flat({name: 3, 'p_rand': 0.1}, base=base) == Parameters.from_flat({'p_rand': 0.1}, base=base)
@@ -56,7 +56,9 @@ def test_names_of_the_version_before_are_left_out_with_a_warning(name: str, capl
 
 
 @pytest.mark.parametrize(('old', 'new'), RENAMED.items())
-def test_former_names_are_taken_with_a_warning(old: str, new: str, caplog: pytest.LogCaptureFixture) -> None:
+def test_former_name_of_a_parameter_is_accepted_with_a_warning(
+    old: str, new: str, caplog: pytest.LogCaptureFixture
+) -> None:
     assert old not in {row.name for row in TABLE}
     value = find(new).low
     assert Parameters.from_flat({old: value}) == Parameters.from_flat({new: value})
@@ -64,17 +66,17 @@ def test_former_names_are_taken_with_a_warning(old: str, new: str, caplog: pytes
     assert new in deprecation(old)
 
 
-def test_constants_have_two_values_and_are_no_parameters() -> None:
+def test_plain_model_sets_all_constants_which_are_no_parameters() -> None:
     assert not {row.name for row in CONSTANTS} & {row.name for row in TABLE}
     plain = Parameters.from_flat({'plain_model': True})
     assert plain == Parameters().varied({'plain_model': True, **{row.name: row.plain for row in CONSTANTS}})
     assert Parameters.from_flat({'plain_model': False}, base=plain) == Parameters()
-    # what does not name it leaves them alone
+    # without plain_model among the values, constants do not change
     other = Parameters().varied({'least_passed': 0.5})
     assert Parameters.from_flat({'p_hit': 0.5, 'plain_model': False}, base=other).search.least_passed == 0.5
 
 
-def test_what_is_complete_is_restored() -> None:
+def test_complete_values_restore_parameters_and_constants() -> None:
     other = Parameters().varied({'least_passed': 0.5, 'live_directions': 2, 'p_hit': 0.5, 'plain_model': True})
     assert Parameters.restored(other.complete()) == other
     assert Parameters.from_flat(other.flat()) != other

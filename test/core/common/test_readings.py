@@ -1,4 +1,4 @@
-"""Readings of several drives."""
+"""Readings of several drives in one table."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ def drive(*names: str) -> Readings:
     )
 
 
-def test_sensors_of_one_name_are_one_sensor() -> None:
+def test_sensors_with_the_same_name_in_two_drives_are_one_sensor() -> None:
     both = of_drives([drive('left', 'right'), drive('front', 'left')])
     assert both.sensor_names == ('front', 'left', 'right')
     assert (both.sensor.tolist(), both.drive.tolist()) == ([1, 2, 0, 1], [0, 0, 1, 1])
 
 
-def test_a_sensor_without_a_name_is_none_of_those_with_one() -> None:
+def test_sensor_without_name_is_not_merged_with_a_named_one() -> None:
     both = of_drives([drive('left'), drive()])
     assert [both.sensor_names[k] for k in both.sensor] == ['left', '']

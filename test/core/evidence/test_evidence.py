@@ -1,4 +1,4 @@
-"""What flipping a cell gains, of every cell at once, against evaluations of whole maps."""
+"""Evidence (the gain of flipping each cell), compared with evaluations of whole maps."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ GRID = Grid(0.1, -4, 7, 12, 9)
 WIDE = Grid(0.1, -7, 12, 41, 33)
 MODEL = plain_model(p_hit=0.6, p_rand=0.1, p_lost=0.1, sigma=0.06)
 OFF = ROUNDING + 3e-8
-"""Nats that a log may be off."""
+"""Largest error of a log, in nats."""
 
 SOME = [naive.awkward_readings, random_readings]
 seeds = st.integers(0, 2**32 - 1)
@@ -55,7 +55,7 @@ def random_case(seed: int, count: int = 60) -> tuple[Readings, ModelParameters, 
 
 
 def without_ties(readings: Readings, model: ModelParameters) -> Readings:
-    """The readings of which rounding does not decide whether a cell is in the cone, or within the cut of the noise."""
+    """The readings for which rounding does not decide whether a cell is in the cone or within the cut of the noise."""
     kept = []
     for t in range(len(readings)):
         away = naive.cells_of(readings, t, GRID, model, 1e-9)
@@ -75,7 +75,7 @@ def evidence_of(readings: Readings, model: ModelParameters, occupied: np.ndarray
 
 
 def snapshot(evidence: Evidence, logs: bool = True) -> list[object]:
-    """All that is kept for readings and cells, but for when they changed and where they lie."""
+    """The whole state of readings and cells, except when they changed and where they are stored."""
     s, n = evidence.state, len(evidence)
     kept = (
         'floor',
@@ -99,7 +99,7 @@ def rebuilt(evidence: Evidence, readings: Readings, model: ModelParameters) -> E
 
 
 @pytest.mark.parametrize('seed', range(24))
-def test_every_log_is_the_difference_of_two_evaluations_of_its_reading(seed: int) -> None:
+def test_each_log_is_the_difference_of_two_evaluations_of_its_reading(seed: int) -> None:
     readings, model, occupied = random_case(seed)
     readings = without_ties(readings, model)
     evidence = evidence_of(readings, model, occupied)
@@ -116,10 +116,10 @@ def test_every_log_is_the_difference_of_two_evaluations_of_its_reading(seed: int
         reading_state = state.reading_states[t]
         assert reading_state['likelihood'] * QUANTUM == pytest.approx(before, abs=OFF)
         free, band, _, logs = naive.pairs_of(state, t)
-        told = dict(zip(band, logs, strict=True))
-        told |= {c: reading_state['release' if occupied[c] else 'occupy'] for c in free}
-        assert set(told) == set(away)
-        for c, log in told.items():
+        actual = dict(zip(band, logs, strict=True))
+        actual |= {c: reading_state['release' if occupied[c] else 'occupy'] for c in free}
+        assert set(actual) == set(away)
+        for c, log in actual.items():
             changed = occupied.copy()
             changed[c] ^= 1
             assert log * QUANTUM == pytest.approx(evaluate(changed) - before, abs=2e-7 + OFF)
@@ -127,7 +127,7 @@ def test_every_log_is_the_difference_of_two_evaluations_of_its_reading(seed: int
 
 
 @pytest.mark.parametrize('seed', range(24))
-def test_the_evidence_of_every_cell_is_what_flipping_it_gains(seed: int) -> None:
+def test_evidence_of_each_cell_is_the_gain_of_flipping_it(seed: int) -> None:
     readings, model, occupied = random_case(seed)
     readings = without_ties(readings, model)
     evidence = evidence_of(readings, model, occupied)
@@ -151,7 +151,7 @@ def test_the_evidence_of_every_cell_is_what_flipping_it_gains(seed: int) -> None
 
 
 @pytest.mark.parametrize('some', SOME)
-def test_what_no_map_changes_is_that_of_the_forward_model(some: object) -> None:
+def test_map_independent_causes_are_those_of_the_forward_model(some: object) -> None:
     readings, model = some(np.random.default_rng(0), GRID, 100), MODEL
     sigma = np.array([naive.sigma_of(readings, t, GRID, model) for t in range(len(readings))])
     reading_states = reading_state_table(readings, sigma, model, GRID.resolution)
@@ -163,7 +163,7 @@ def test_what_no_map_changes_is_that_of_the_forward_model(some: object) -> None:
 
 @pytest.mark.parametrize('some', SOME)
 @pytest.mark.parametrize('grid', [WIDE, Grid(0.25, 0, 0, 9, 20)], ids=['fine', 'coarse'])
-def test_seers_of_a_cell_are_the_readings_that_have_it(some: object, grid: Grid) -> None:
+def test_observing_readings_of_a_cell_are_those_whose_cone_has_it(some: object, grid: Grid) -> None:
     readings = some(np.random.default_rng(1), grid, 250)
     model = plain_model(sigma=0.03)
     evidence = evidence_of(readings, model, np.zeros(grid.size, np.uint8), grid=grid)
@@ -184,7 +184,7 @@ def test_seers_of_a_cell_are_the_readings_that_have_it(some: object, grid: Grid)
 
 @settings(max_examples=60, deadline=None)
 @given(seeds, st.lists(st.integers(0, GRID.size - 1), max_size=25), st.sampled_from([math.inf, 0, 4000]))
-def test_after_flips_all_is_as_if_built_from_the_new_map(seed: int, cells: list[int], memory: float) -> None:
+def test_state_after_flips_equals_a_state_built_from_the_new_map(seed: int, cells: list[int], memory: float) -> None:
     readings, model, occupied = random_case(seed, 40)
     evidence = evidence_of(readings, model, occupied, memory=memory)
     for c in cells:
@@ -200,7 +200,7 @@ def test_after_flips_all_is_as_if_built_from_the_new_map(seed: int, cells: list[
 
 @settings(max_examples=80, deadline=None)
 @given(seeds, st.lists(st.sets(st.integers(0, GRID.size - 1), max_size=30), max_size=4), st.sampled_from([math.inf, 0]))
-def test_after_flips_at_once_all_is_as_if_built_from_the_new_map(
+def test_state_after_flips_at_once_equals_one_built_from_the_new_map(
     seed: int, sets: list[set[int]], memory: float
 ) -> None:
     readings, model, occupied = random_case(seed, 40)
@@ -214,19 +214,19 @@ def test_after_flips_at_once_all_is_as_if_built_from_the_new_map(
     assert snapshot(evidence) == snapshot(fresh)
 
 
-def test_flips_at_once_evaluate_no_reading_that_sees_none_of_them() -> None:
+def test_flips_at_once_evaluate_only_readings_that_see_them() -> None:
     readings = random_readings(np.random.default_rng(2), GRID, 50)
     evidence = evidence_of(readings, MODEL, np.zeros(GRID.size, np.uint8))
     evidence.state.clock[0] = 7
     evidence.flip(np.array([50, 3]))
-    seers = {int(t) for c in (50, 3) for t in evidence.state.observing[: find_observing(evidence.state, c), 0]}
-    assert 0 < len(seers) < 50
-    assert set(np.flatnonzero(evidence.state.reading_states['changed'] == 7)) == seers
+    observing = {int(t) for c in (50, 3) for t in evidence.state.observing[: find_observing(evidence.state, c), 0]}
+    assert 0 < len(observing) < 50
+    assert set(np.flatnonzero(evidence.state.reading_states['changed'] == 7)) == observing
 
 
 @settings(max_examples=40, deadline=None)
 @given(seeds, st.lists(st.integers(0, GRID.size - 1), max_size=10), st.booleans())
-def test_flipping_there_and_back_changes_nothing(seed: int, cells: list[int], backwards: bool) -> None:
+def test_flipping_cells_twice_restores_the_state(seed: int, cells: list[int], backwards: bool) -> None:
     readings, model, occupied = random_case(seed, 40)
     evidence = evidence_of(readings, model, occupied)
     before = snapshot(evidence)
@@ -235,7 +235,7 @@ def test_flipping_there_and_back_changes_nothing(seed: int, cells: list[int], ba
     assert snapshot(evidence) == before
 
 
-def test_a_flip_notes_which_readings_it_changed() -> None:
+def test_flip_marks_the_readings_that_it_changed() -> None:
     readings = random_readings(np.random.default_rng(2), GRID, 50)
     evidence = evidence_of(readings, MODEL, np.zeros(GRID.size, np.uint8))
     for now, c in enumerate((50, 3, 50), 1):
@@ -248,7 +248,7 @@ def test_a_flip_notes_which_readings_it_changed() -> None:
 
 @pytest.mark.parametrize('seed', range(6))
 @pytest.mark.parametrize('part', [0.0, 0.3, 0.9])
-def test_readings_without_memory_come_to_the_same(seed: int, part: float) -> None:
+def test_state_does_not_depend_on_how_many_readings_are_stored(seed: int, part: float) -> None:
     readings, model, occupied = random_case(seed, 150)
     whole = evidence_of(readings, model, occupied)
     words = int(whole._totals[3])
@@ -267,7 +267,7 @@ def test_readings_without_memory_come_to_the_same(seed: int, part: float) -> Non
 
 @pytest.mark.parametrize('cuts', [[50], [1, 2, 3, 60], [0, 99, 100]])
 @pytest.mark.parametrize('memory', [math.inf, 6000.0, 0.0])
-def test_readings_in_portions_come_to_the_same_as_all_at_once(cuts: list[int], memory: float) -> None:
+def test_readings_in_portions_give_the_state_of_all_at_once(cuts: list[int], memory: float) -> None:
     readings, model, occupied = random_case(8, 100)
     whole = evidence_of(readings, model, occupied, memory=memory)
     parts = Evidence(GRID, model, memory=memory, start=occupied.reshape(GRID.shape))
@@ -278,7 +278,7 @@ def test_readings_in_portions_come_to_the_same_as_all_at_once(cuts: list[int], m
     assert (parts.pairs, parts.unstored) == (whole.pairs, whole.unstored)
 
 
-def test_readings_in_portions_take_no_more_memory_than_is_allowed() -> None:
+def test_readings_in_portions_stay_within_the_memory_limit() -> None:
     readings, model, _ = random_case(8, 100)
     evidence = Evidence(GRID, model, memory=6000.0)
     for part in np.split(np.arange(100), 10):
@@ -286,7 +286,7 @@ def test_readings_in_portions_take_no_more_memory_than_is_allowed() -> None:
         assert evidence.state.pairs.cell.nbytes <= 6000
 
 
-def test_readings_may_come_after_flips() -> None:
+def test_readings_added_after_flips_give_the_state_of_the_new_map() -> None:
     readings, model, occupied = random_case(9, 100)
     evidence = evidence_of(readings.select(slice(0, 60)), model, np.zeros(GRID.size, np.uint8))
     for c in np.flatnonzero(occupied):
@@ -297,7 +297,9 @@ def test_readings_may_come_after_flips() -> None:
 
 @pytest.mark.parametrize('memory', [math.inf, 3000.0])
 @pytest.mark.parametrize('workers', [2, 3, 8])
-def test_the_number_of_threads_changes_nothing(monkeypatch: pytest.MonkeyPatch, memory: float, workers: int) -> None:
+def test_number_of_threads_does_not_change_the_state(
+    monkeypatch: pytest.MonkeyPatch, memory: float, workers: int
+) -> None:
     readings, model, occupied = random_case(10, 101)
     one = evidence_of(readings, model, occupied, memory=memory)
     monkeypatch.setattr(threads, 'LEAST_PART', 7)
@@ -315,7 +317,7 @@ def test_the_number_of_threads_changes_nothing(monkeypatch: pytest.MonkeyPatch, 
 
 @pytest.mark.parametrize('memory', [math.inf, 0.0])
 @pytest.mark.parametrize('seed', [12, 13])
-def test_a_reading_of_weight_three_is_three_readings(seed: int, memory: float) -> None:
+def test_reading_of_weight_three_equals_three_readings(seed: int, memory: float) -> None:
     readings, model, occupied = random_case(seed, 40)
     thrice = evidence_of(readings.select(np.repeat(np.arange(40), 3)), model, occupied)
     heavy = evidence_of(readings, model, occupied, memory=memory)
@@ -327,12 +329,12 @@ def test_a_reading_of_weight_three_is_three_readings(seed: int, memory: float) -
         assert heavy.log_likelihood == thrice.log_likelihood
         flip(heavy.state, c)
         flip(thrice.state, c)
-    told = heavy.state.maps.evidence.copy()
+    actual = heavy.state.maps.evidence.copy()
     heavy.rebuild()
-    assert np.array_equal(heavy.state.maps.evidence, told)
+    assert np.array_equal(heavy.state.maps.evidence, actual)
 
 
-def test_readings_that_gain_weight_are_noted_as_changed() -> None:
+def test_readings_that_gain_weight_are_marked_as_changed() -> None:
     readings, model, occupied = random_case(14, 10)
     evidence = evidence_of(readings, model, occupied)
     flip(evidence.state, 0)
@@ -346,7 +348,7 @@ def test_readings_that_gain_weight_are_noted_as_changed() -> None:
 
 @pytest.mark.parametrize('seed', [0, 1, 2, 3, 5, 7])
 @pytest.mark.parametrize('memory', [math.inf, 4000.0, 0.0])
-def test_a_grid_that_grew_is_as_if_it_had_been_larger_from_the_start(seed: int, memory: float) -> None:
+def test_state_on_a_grown_grid_equals_that_on_a_large_grid(seed: int, memory: float) -> None:
     readings, model, _ = random_case(seed, 120)
     early, late = readings.select(slice(0, 80)), readings.select(slice(80, 120))
     box = grid_of(early, model, GridParameters())
@@ -373,7 +375,7 @@ def test_a_grid_that_grew_is_as_if_it_had_been_larger_from_the_start(seed: int, 
     assert found[0] == found[1]
 
 
-def test_cells_are_unknown_where_no_reading_sees_them() -> None:
+def test_cells_that_no_reading_sees_are_unknown() -> None:
     readings, model = random_readings(np.random.default_rng(3), WIDE, 4), MODEL
     occupied = np.ones(WIDE.size, np.uint8)
     evidence = evidence_of(readings, model, occupied, grid=WIDE)
@@ -383,7 +385,7 @@ def test_cells_are_unknown_where_no_reading_sees_them() -> None:
     assert (evidence.state.maps.evidence[evidence.state.maps.seen == 0] == 0).all()
 
 
-def test_no_readings_say_nothing() -> None:
+def test_without_readings_log_likelihood_is_zero_and_all_cells_unknown() -> None:
     evidence = evidence_of(random_readings(np.random.default_rng(0), GRID, 0), MODEL, np.zeros(GRID.size, np.uint8))
     flip(evidence.state, 3)
     evidence.rebuild()
@@ -408,7 +410,7 @@ def test_building_can_be_cancelled() -> None:
         evidence.extend(random_case(0)[0])
 
 
-def test_far_from_the_origin_of_the_map_frame_nothing_changes_but_rounding() -> None:
+def test_far_from_the_origin_evidence_differs_only_by_rounding() -> None:
     readings = random_readings(np.random.default_rng(5), GRID, 60)
     occupied = np.zeros(GRID.size, np.uint8)
     near = evidence_of(readings, MODEL, occupied)

@@ -1,4 +1,4 @@
-"""Evidence whose work fails in the middle: for want of memory, or because it was cancelled."""
+"""Evidence whose computation stops half way: out of memory, or cancelled."""
 
 from __future__ import annotations
 
@@ -29,8 +29,8 @@ EARLY, LATE = slice(0, 40), slice(40, 60)
 Step = Callable[[Evidence], None]
 
 
-def told(evidence: Evidence) -> list[object]:
-    """Everything that is kept, the normals of surfaces and the readings of each tile included."""
+def full_state(evidence: Evidence) -> list[object]:
+    """The whole state, including normals of surfaces and the readings of each tile."""
     normals, tiles = evidence.state.normals, evidence.state.tiles
     lists = [tiles.head.tolist(), tiles.fill.tolist(), tiles.latest.tolist(), int(tiles.used[0])]
     sums = [] if evidence._sums is None else evidence._sums.tolist()
@@ -40,14 +40,14 @@ def told(evidence: Evidence) -> list[object]:
 
 def case(seed: int) -> tuple[Readings, Any, np.ndarray]:
     readings, model, occupied = random_case(seed, 60)
-    # enough echoes from about the same place for normals to be known
+    # enough echoes from about the same place, so that normals are known
     readings.x[:30], readings.y[:30] = readings.x[0], readings.y[0]
     readings.z[:30] = np.minimum(readings.z[0], 0.5 * readings.z_max[:30])
     return readings, dataclasses.replace(model, max_incidence_angle=0.5), occupied
 
 
 def steps(readings: Readings) -> dict[str, tuple[list[Step], Step]]:
-    """What is done before, and what fails."""
+    """Steps done before, and the step that fails."""
 
     def first(evidence: Evidence) -> None:
         evidence.extend(readings.select(EARLY))
@@ -65,7 +65,7 @@ def steps(readings: Readings) -> dict[str, tuple[list[Step], Step]]:
 @pytest.mark.parametrize('memory', [np.inf, 3000.0])
 @pytest.mark.parametrize('name', ['first', 'more', 'grow'])
 @pytest.mark.parametrize('renewable', [True, False])
-def test_want_of_memory_leaves_everything_as_it_was(
+def test_step_without_memory_leaves_the_state_unchanged(
     monkeypatch: pytest.MonkeyPatch, name: str, memory: float, renewable: bool
 ) -> None:
     readings, model, occupied = case(20)
@@ -81,20 +81,20 @@ def test_want_of_memory_leaves_everything_as_it_was(
     whole = made()
     fails(whole)
     assert whole.state.normals.known.any()
-    expected = told(whole)
+    expected = full_state(whole)
     allocations = Allocations(monkeypatch)
     failed = 0
     for which in range(1, 1000):
         evidence = made()
-        untouched = told(evidence)
+        untouched = full_state(evidence)
         try:
             with allocations.failing(which):
                 fails(evidence)
         except MemoryError:
             failed += 1
-            assert told(evidence) == untouched
+            assert full_state(evidence) == untouched
             fails(evidence)
-        assert told(evidence) == expected
+        assert full_state(evidence) == expected
         if allocations.count < which:
             break
     assert failed > 8
@@ -102,9 +102,7 @@ def test_want_of_memory_leaves_everything_as_it_was(
 
 @pytest.mark.parametrize('kernel', ['insert_readings', 'evaluate_all'])
 @pytest.mark.parametrize('name', ['first', 'more', 'grow'])
-def test_cancelled_in_the_middle_everything_is_as_it_was(
-    monkeypatch: pytest.MonkeyPatch, name: str, kernel: str
-) -> None:
+def test_cancelled_step_leaves_the_state_unchanged(monkeypatch: pytest.MonkeyPatch, name: str, kernel: str) -> None:
     readings, model, occupied = case(21)
     before, fails = steps(readings)[name]
     monkeypatch.setattr(threads, 'LEAST_PART', 5)
@@ -115,7 +113,7 @@ def test_cancelled_in_the_middle_everything_is_as_it_was(
         step(evidence)
         step(whole)
     fails(whole)
-    untouched = told(evidence)
+    untouched = full_state(evidence)
     where = indexed_readings if kernel == 'insert_readings' else module
     real = getattr(where, kernel)
 
@@ -136,13 +134,13 @@ def test_cancelled_in_the_middle_everything_is_as_it_was(
         with pytest.raises(Cancelled):
             fails(evidence)
     stop[0] = 0
-    assert told(evidence) == untouched
+    assert full_state(evidence) == untouched
     fails(evidence)
-    assert told(evidence) == told(whole)
+    assert full_state(evidence) == full_state(whole)
 
 
 @pytest.mark.parametrize('at_once', [False, True])
-def test_cancelled_while_it_is_rebuilt_the_evidence_is_that_of_the_map(at_once: bool) -> None:
+def test_evidence_is_complete_after_a_cancelled_rebuild(at_once: bool) -> None:
     readings, model, occupied = case(22)
     stop = np.zeros(1, np.uint8)
     evidence = Evidence(GRID, model, start=occupied.reshape(GRID.shape), stop=stop)
@@ -158,19 +156,19 @@ def test_cancelled_while_it_is_rebuilt_the_evidence_is_that_of_the_map(at_once: 
 
 
 @pytest.mark.parametrize('readings', [[-1], [3, 40], [10**9]])
-def test_readings_that_are_not_there_cannot_gain_weight(readings: list[int]) -> None:
+def test_weight_for_unknown_readings_is_rejected(readings: list[int]) -> None:
     some, model, occupied = case(23)
     evidence = Evidence(GRID, model, start=occupied.reshape(GRID.shape))
     evidence.extend(some.select(EARLY))
-    before = told(evidence)
+    before = full_state(evidence)
     with pytest.raises(ValueError, match='there are 40'):
         evidence.add_multiplicity(np.array(readings))
     with pytest.raises(ValueError, match='there are 40'):
         evidence.extend(some.select(slice(0, 0)), np.array(readings))
-    assert told(evidence) == before
+    assert full_state(evidence) == before
 
 
-def test_threads_for_which_there_is_no_memory_are_done_without(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_fewer_threads_are_used_if_memory_is_short(monkeypatch: pytest.MonkeyPatch) -> None:
     readings, model, occupied = case(24)
     monkeypatch.setattr(threads, 'LEAST_PART', 5)
     one = Evidence(GRID, model, start=occupied.reshape(GRID.shape))
@@ -190,7 +188,7 @@ def test_threads_for_which_there_is_no_memory_are_done_without(monkeypatch: pyte
 
 
 def in_lockstep(work: Callable[[], None], files: tuple[str, ...]) -> None:
-    """Have the threads that `work` starts wait for one another before every line of `files`."""
+    """Make the threads that `work` starts wait for each other before each line of `files`."""
     barrier = threading.Barrier(2)
 
     def line(frame: Any, event: str, argument: object) -> Any:
@@ -211,7 +209,7 @@ def in_lockstep(work: Callable[[], None], files: tuple[str, ...]) -> None:
         threading.settrace(sys.gettrace())  # type: ignore[arg-type]
 
 
-def test_threads_that_wait_for_one_another_come_to_the_same_as_one(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_threads_in_lockstep_give_the_result_of_one_thread(monkeypatch: pytest.MonkeyPatch) -> None:
     readings, model, occupied = case(25)
     monkeypatch.setattr(threads, 'LEAST_PART', 30)
     start = occupied.reshape(GRID.shape)

@@ -1,4 +1,4 @@
-"""Whole-number logs against `math.log`."""
+"""Logarithms in fixed point, compared with `math.log`."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from forward_grid_mapper.core.evidence.updates import LEAST_RATIO
 from forward_grid_mapper.core.search.search import ROUNDING
 
 POLYNOMIAL = 2e-9
-"""Nats that the polynomial may be off; half a unit comes on top."""
+"""Largest error of the polynomial in nats; rounding adds half a quantum."""
 
 
 def logs_of(values: np.ndarray) -> np.ndarray:
@@ -25,7 +25,7 @@ def logs_of(values: np.ndarray) -> np.ndarray:
     return out[:-1]
 
 
-def test_logs_are_right_over_the_whole_range() -> None:
+def test_logs_are_accurate_over_the_whole_range() -> None:
     values = np.geomspace(LEAST_RATIO, 1e6, 200_001).astype(np.float32)
     near_one = np.float32(1) + np.arange(-3000, 3000, dtype=np.float32) * np.float32(2**-24)
     edges = np.ldexp(np.float32(math.sqrt(0.5)), np.arange(-99, 20)).astype(np.float32)
@@ -36,16 +36,16 @@ def test_logs_are_right_over_the_whole_range() -> None:
 
 
 @given(st.floats(LEAST_RATIO, 1e6))
-def test_the_log_of_a_ratio_is_off_by_less_than_the_search_allows_for(ratio: float) -> None:
+def test_error_of_a_log_is_below_the_tolerance_of_the_search(ratio: float) -> None:
     # rounding to float32 included
     error = logs_of(np.array([ratio]))[0] * QUANTUM - math.log(ratio)
     assert abs(error) <= 2**-24 + QUANTUM / 2 + POLYNOMIAL < ROUNDING
 
 
-def test_the_log_of_one_is_nothing_and_those_of_powers_of_two_are_multiples() -> None:
-    told = logs_of(2.0 ** np.arange(-90, 21))
-    assert told[90] == 0
-    assert (told == np.floor(np.arange(-90, 21) * (math.log(2) / QUANTUM) + 0.5)).all()
+def test_log_of_one_is_zero_and_logs_of_powers_of_two_are_multiples() -> None:
+    actual = logs_of(2.0 ** np.arange(-90, 21))
+    assert actual[90] == 0
+    assert (actual == np.floor(np.arange(-90, 21) * (math.log(2) / QUANTUM) + 0.5)).all()
 
 
 def test_logs_ascend_with_the_ratios() -> None:
@@ -54,6 +54,6 @@ def test_logs_ascend_with_the_ratios() -> None:
 
 
 @pytest.mark.parametrize('m', [0, 1, 2, 3, 5, 8, 13, 31, 64, 100])
-def test_the_number_of_ratios_does_not_matter(m: int) -> None:
+def test_log_of_a_ratio_does_not_depend_on_the_number_of_ratios(m: int) -> None:
     values = np.random.default_rng(m).uniform(1e-6, 50, m)
     assert logs_of(values).tolist() == [int(logs_of(values[k : k + 1])[0]) for k in range(m)]

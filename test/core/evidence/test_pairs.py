@@ -1,4 +1,4 @@
-"""The pairs of readings against naive zones and densities."""
+"""Pairs of readings and cells, compared with zones and densities in plain Python."""
 
 from __future__ import annotations
 
@@ -42,17 +42,17 @@ def test_runs_and_band_are_the_free_zone_and_the_rest_of_the_cone(some: object) 
         assert all(away[c] >= end - 1e-9 for c in band)
         assert [away[c] for c in band] == sorted(away[c] for c in band)
         sigma = naive.sigma_of(readings, t, GRID, model)
-        for c, told in zip(band, density, strict=True):
-            # where the noise is cut off, rounding may decide
+        for c, actual in zip(band, density, strict=True):
+            # at the cut of the noise, rounding may decide
             if abs(abs(readings.z[t] - away[c]) - CUT * sigma) > 1e-9:
-                assert told == pytest.approx(naive.normal(readings.z[t], away[c], sigma), rel=1e-6, abs=1e-30)
+                assert actual == pytest.approx(naive.normal(readings.z[t], away[c], sigma), rel=1e-6, abs=1e-30)
         seen[free + band] += 1
         pairs += len(free) + len(band)
     assert evidence.pairs == pairs
     assert np.array_equal(state.maps.seen, seen)
 
 
-def test_each_run_lies_in_one_row() -> None:
+def test_each_run_is_in_one_row() -> None:
     evidence = Evidence(GRID, plain_model(sigma=0.01))
     evidence.extend(random_readings(np.random.default_rng(5), GRID, 60))
     state = evidence.state
@@ -62,7 +62,7 @@ def test_each_run_lies_in_one_row() -> None:
         assert (runs[:, 0] // GRID.width == runs[:, 1] // GRID.width).all()
 
 
-def test_cells_of_equal_distance_stay_in_the_order_of_the_grid() -> None:
+def test_cells_at_equal_distance_are_in_the_order_of_the_grid() -> None:
     grid = Grid(0.1, 0, 0, 21, 21)
     readings = naive.awkward_readings(np.random.default_rng(6), grid, 1)
     for name, value in {'x': 1.05, 'y': 1.05, 'yaw': 0.0, 'z': 0.5, 'z_max': 2.0, 'half_angle': 1.5}.items():
@@ -74,7 +74,7 @@ def test_cells_of_equal_distance_stay_in_the_order_of_the_grid() -> None:
     assert list(zip(squares, band, strict=True)) == sorted(zip(squares, band, strict=True))
 
 
-def test_pairs_made_anew_are_those_that_are_stored() -> None:
+def test_recomputed_pairs_equal_the_stored_ones() -> None:
     model = plain_model()
     evidence = Evidence(GRID, model)
     evidence.extend(naive.awkward_readings(np.random.default_rng(7), GRID, 100))
@@ -94,7 +94,7 @@ def test_pairs_made_anew_are_those_that_are_stored() -> None:
         max_size=60,
     )
 )
-def test_the_sort_is_stable(keys: list[float]) -> None:
+def test_sort_is_stable(keys: list[float]) -> None:
     workspace = workspace_for(60)
     room = np.full(len(workspace.tally) + 10, -1, np.int32)
     workspace, m = workspace._replace(tally=room[: len(workspace.tally)]), len(keys)

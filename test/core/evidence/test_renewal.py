@@ -1,4 +1,4 @@
-"""Surface normals that are renewed as readings come: all is as if the readings had come at once."""
+"""Surface normals renewed as readings come: the result equals that of all readings at once."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ MODEL = ModelParameters(sigma=0.06, p_hit=0.6, p_rand=0.1, p_lost=0.1, max_incid
 
 
 def along_wall(count: int, seed: int = 0) -> Readings:
-    """Readings of a robot that passes a wall at y = 3, at all slants, many of which receive no echo of it."""
+    """Readings of a robot that passes a wall at y = 3, at all incidence angles; many have no echo of it."""
     rng = np.random.default_rng(seed)
     readings = random_readings(rng, GRID, count, z_max=2.5)
     readings.y[:] = 1.5 + 0.3 * rng.random(count)
@@ -34,7 +34,7 @@ def along_wall(count: int, seed: int = 0) -> Readings:
 
 
 def portions(readings: Readings, memory: float, size: int = 7) -> Evidence:
-    """The readings in portions, with normals renewed after every third."""
+    """Evidence of the readings in portions, with normals renewed after every third portion."""
     evidence = Evidence(GRID, MODEL, memory, renewable=True)
     for k in range(0, len(readings), size):
         evidence.extend(readings.select(slice(k, k + size)))
@@ -50,7 +50,7 @@ def same_normals(a: Evidence, b: Evidence) -> bool:
 
 @pytest.mark.parametrize('memory', [math.inf, 8000.0, 0.0])
 @pytest.mark.parametrize('seed', range(4))
-def test_in_portions_with_normals_renewed_all_is_as_if_at_once(seed: int, memory: float) -> None:
+def test_portions_with_renewed_normals_give_the_state_of_all_at_once(seed: int, memory: float) -> None:
     readings = along_wall(300, seed)
     whole = Evidence(GRID, MODEL)
     whole.extend(readings)
@@ -58,7 +58,7 @@ def test_in_portions_with_normals_renewed_all_is_as_if_at_once(seed: int, memory
     assert whole.state.normals.known.any()
     assert same_normals(evidence, whole)
     assert snapshot(evidence, logs=False) == snapshot(whole, logs=False)
-    # and it stays right through flips
+    # it stays equal after flips
     for c in np.random.default_rng(seed).permutation(GRID.size)[:30]:
         flip(evidence.state, c)
         flip(whole.state, c)
@@ -71,14 +71,14 @@ def test_in_portions_with_normals_renewed_all_is_as_if_at_once(seed: int, memory
 
 
 @pytest.mark.parametrize('seed', range(6))
-def test_where_little_came_no_less_is_renewed_than_changes(seed: int) -> None:
+def test_after_a_few_readings_all_changed_normals_are_renewed(seed: int) -> None:
     wide = Grid(0.1, -60, 12, 120, 24)
     rng = np.random.default_rng(seed)
     first, later = along_wall(900, seed), along_wall(12, seed + 100)
     first.x[:] = rng.uniform(-4.5, 4.5, len(first))
     later.x[:] = rng.uniform(0.0, 0.2, len(later))
     later.yaw[:] = math.pi / 2 + rng.uniform(-0.6, 0.6, len(later))
-    # so short that what they change lies in a small part of the map
+    # so short that their changes lie in a small part of the map
     for readings, far in ((first, 2.5), (later, 1.6)):
         readings.z_max[:] = far
         readings.z[:] = np.minimum(readings.z, far)
@@ -103,7 +103,7 @@ def test_where_little_came_no_less_is_renewed_than_changes(seed: int) -> None:
     assert snapshot(evidence, logs=False) == snapshot(whole, logs=False)
 
 
-def test_readings_that_are_merged_tell_of_normals_again() -> None:
+def test_readings_that_gain_weight_change_normals() -> None:
     readings = along_wall(60)
     whole, merged = Evidence(GRID, MODEL), Evidence(GRID, MODEL, renewable=True)
     whole.extend(readings.select(np.repeat(np.arange(60), [3] * 30 + [2] * 30)))
@@ -118,7 +118,7 @@ def test_readings_that_are_merged_tell_of_normals_again() -> None:
     assert merged.log_likelihood == whole.log_likelihood
 
 
-def test_what_changed_is_inside_the_window_that_is_returned() -> None:
+def test_renewal_returns_a_window_that_contains_all_changes() -> None:
     readings = along_wall(200)
     evidence = Evidence(GRID, MODEL, renewable=True)
     assert evidence.renew_normals() is None
@@ -135,7 +135,7 @@ def test_what_changed_is_inside_the_window_that_is_returned() -> None:
     assert evidence.renew_normals() is None
 
 
-def test_renewed_on_a_grid_that_grew(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_normals_renewed_on_a_grown_grid_equal_those_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
     readings = along_wall(200)
     inside = (np.abs(readings.x - 0.5) < 0.6) & (readings.z < 1.7)
     readings = readings.select(inside)
@@ -153,7 +153,7 @@ def test_renewed_on_a_grid_that_grew(monkeypatch: pytest.MonkeyPatch) -> None:
     assert snapshot(evidence, logs=False) == snapshot(whole, logs=False)
 
 
-def test_words_out_of_use_are_packed_away(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_unused_words_of_pairs_are_removed(monkeypatch: pytest.MonkeyPatch) -> None:
     readings = along_wall(400)
     monkeypatch.setattr(module, 'MOST_UNUSED', 1.0)
     loose = portions(readings, math.inf)

@@ -1,4 +1,4 @@
-"""The lists of readings by tile: nobody is missing, nobody is there twice, and lists grow without loss."""
+"""Lists of readings by tile: each reading once, none missing, also after lists have grown."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from samples import plain_model, random_readings
 @pytest.mark.parametrize('some', [naive.awkward_readings, random_readings])
 @pytest.mark.parametrize('grid', [Grid(0.1, -7, 12, 41, 33), Grid(0.1, 0, 0, 8, 16), Grid(0.1, 3, 3, 1, 9)])
 @pytest.mark.parametrize('batches', [1, 7])
-def test_a_tile_lists_every_reading_that_sees_one_of_its_cells_once(some: object, grid: Grid, batches: int) -> None:
+def test_tile_lists_each_reading_that_sees_one_of_its_cells_once(some: object, grid: Grid, batches: int) -> None:
     readings = some(np.random.default_rng(1), grid, 300)
     evidence = Evidence(grid, plain_model(sigma=0.03))
     for part in np.array_split(np.arange(len(readings)), batches):
@@ -31,7 +31,7 @@ def test_a_tile_lists_every_reading_that_sees_one_of_its_cells_once(some: object
     assert max(map(len, expected)) > CHUNK, 'too few to need a chain'
 
 
-def test_a_grid_has_tiles_for_all_of_its_cells() -> None:
+def test_tiles_cover_all_cells_of_a_grid() -> None:
     for height, width, up, across in (
         (1, 1, 1, 1),
         (8, 8, 1, 1),
@@ -45,7 +45,7 @@ def test_a_grid_has_tiles_for_all_of_its_cells() -> None:
         assert all(naive.readings_of_tile(tiles, k) == [] for k in range(len(tiles.head)))
 
 
-def test_lists_keep_what_they_have_as_they_grow() -> None:
+def test_lists_keep_their_readings_as_they_grow() -> None:
     rng = np.random.default_rng(2)
     tiles = more_chunks(no_tiles(40, 50))
     kept: list[list[int]] = [[] for _ in tiles.head]

@@ -1,4 +1,4 @@
-"""Poses and stamps that contradict the readings: warned of with the cause, and sound drives never."""
+"""Warnings about poses and stamps that contradict the readings, with the cause; correct drives give none."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ from quality_worlds import OWN, ROUGHER, ring
 
 
 class Messages(NamedTuple):
-    """What a robot sends, and where its sensors are said to be."""
+    """The messages of a robot, and the stated poses of its sensors."""
 
     extrinsics: dict[str, Pose2]
     odometry: list[OdometryMessage]
@@ -59,13 +59,13 @@ class Messages(NamedTuple):
 
 @lru_cache(maxsize=1)
 def office() -> Messages:
-    """Through the rooms of a building, with eight sonars in front."""
+    """A drive through the rooms of a building, with eight sonars in front."""
     made = building_drive(0, 1, NOISY, True, front_array())
-    # ten poses a second are enough
+    # ten poses a second are sufficient
     return Messages(dict(made.extrinsics), list(made.odometry[::5]), list(made.ranges))
 
 
-def told(messages: Messages) -> list[str]:
+def warnings_of(messages: Messages) -> list[str]:
     return consistency_warnings(associated(*messages).readings, messages.extrinsics)
 
 
@@ -152,23 +152,23 @@ FEW = (
     'ranges half a second late',
     'half of the field of view',
 )
-"""Those that are tried first, one of each kind."""
+"""One scenario of each kind, tried first."""
 
 
 @pytest.mark.parametrize(
     'name', [*FEW, *(pytest.param(name, marks=pytest.mark.slow) for name in sorted({*SCENARIOS} - {*FEW}))]
 )
-def test_wrong_poses_are_warned_of(name: str) -> None:
+def test_wrong_poses_give_one_warning_with_the_cause(name: str) -> None:
     change, expected = SCENARIOS[name]
-    warnings = told(change(office()))
+    warnings = warnings_of(change(office()))
     assert len(warnings) == 1, 'one cause, one warning'
     assert re.search(expected, warnings[0]), warnings
 
 
 def in_a_room(turns: Callable[[float], float]) -> Messages:
-    """A robot that turns by 0.5 rad/s and drives in turn, in a room of 8 by 6 metres; `turns` changes its yaw.
+    """A robot in a room of 8 by 6 metres that alternately turns by 0.5 rad/s and drives; `turns` changes its yaw.
 
-    Eight sensors measure one after the other, 80 times a second, and odometry has 20 messages.
+    Eight sensors measure one after the other, 80 times a second; odometry has 20 messages a second.
     """
     rng = np.random.default_rng(4)
     extrinsics = {f'sonar_{n}': Pose2(0.0, 0.0, n * math.pi / 4) for n in range(8)}
@@ -185,20 +185,20 @@ def in_a_room(turns: Callable[[float], float]) -> Messages:
     return Messages(extrinsics, odometry, ranges)
 
 
-def test_yaw_in_degrees() -> None:
-    assert told(in_a_room(lambda yaw: yaw)) == []
-    (warning,) = told(in_a_room(lambda yaw: math.remainder(math.degrees(yaw), math.tau)))
+def test_yaw_in_degrees_gives_a_warning() -> None:
+    assert warnings_of(in_a_room(lambda yaw: yaw)) == []
+    (warning,) = warnings_of(in_a_room(lambda yaw: math.remainder(math.degrees(yaw), math.tau)))
     assert re.search(r'the yaw of the robot turns at \d\d rad/s: is it in degrees\?.*half the yaw in radians', warning)
 
 
-def test_odometry_that_jumps_or_trembles_is_not_in_degrees() -> None:
+def test_jumps_and_noise_of_the_yaw_give_no_warning_of_degrees() -> None:
     rng = np.random.default_rng(0)
-    assert told(in_a_room(lambda yaw: yaw + rng.normal(0, 0.01))) == []
-    assert told(in_a_room(lambda yaw: yaw + 2.0 * (rng.random() < 0.01))) == []
+    assert warnings_of(in_a_room(lambda yaw: yaw + rng.normal(0, 0.01))) == []
+    assert warnings_of(in_a_room(lambda yaw: yaw + 2.0 * (rng.random() < 0.01))) == []
 
 
 def drives() -> Iterator[tuple[str, Callable[[], Recording]]]:
-    """Every simulated world, with either array."""
+    """All simulated worlds, with both arrays."""
     for sonars in (front_array, sonar_ring):
         for seen in (1, 3, 16):
             yield f'door {seen} {sonars.__name__}', lambda n=seen, s=sonars: door_drive(n, NOISY, 0, s())
@@ -222,7 +222,7 @@ DRIVES = dict(drives())
 
 @pytest.mark.slow
 @pytest.mark.parametrize('name', sorted(DRIVES))
-def test_no_alarm_in_the_simulated_worlds(name: str) -> None:
+def test_simulated_worlds_give_no_warning(name: str) -> None:
     recording = DRIVES[name]()
     assert consistency_warnings(recording.readings, dict(recording.extrinsics)) == []
 
@@ -230,7 +230,7 @@ def test_no_alarm_in_the_simulated_worlds(name: str) -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize('odometry', ['/odom', '/odom_corrected'])
 @pytest.mark.parametrize('name', ['office_a', 'office_b', 'building_a', 'building_b', 'building_c'])
-def test_no_alarm_on_the_recordings(shared: Path, name: str, odometry: str) -> None:
+def test_real_recordings_give_no_warning(shared: Path, name: str, odometry: str) -> None:
     from forward_grid_mapper.recordings.read_drive import read_drive
 
     bag = shared / 'data' / name / 'bag'
@@ -242,7 +242,7 @@ def test_no_alarm_on_the_recordings(shared: Path, name: str, odometry: str) -> N
 
 
 @pytest.mark.slow
-def test_wide_cones_are_named_on_a_recording_whose_odometry_drifts(shared: Path) -> None:
+def test_wide_cones_are_named_on_a_recording_with_drift(shared: Path) -> None:
     from forward_grid_mapper.recordings.read_drive import read_drive
 
     found = read_drive(shared / 'data' / 'building_b' / 'bag', Parameters(), {}, None, '/odom')
@@ -252,7 +252,7 @@ def test_wide_cones_are_named_on_a_recording_whose_odometry_drifts(shared: Path)
     assert re.search(r'the field of view is stated as 86 degrees, but the readings fit about (21|43) degrees', warning)
 
 
-def test_nothing_is_said_of_few_readings_or_unknown_sensors() -> None:
+def test_few_readings_or_unknown_sensors_give_no_warning() -> None:
     recording = building_drive(0, 1, NOISY, True, front_array())
     backwards = {frame: turned(180)(pose) for frame, pose in recording.extrinsics}
     r, count = recording.readings, len(recording.readings)
@@ -264,7 +264,7 @@ def test_nothing_is_said_of_few_readings_or_unknown_sensors() -> None:
     assert count > 1000
 
 
-def test_a_robot_that_stands_is_no_fault() -> None:
+def test_robot_at_standstill_gives_no_warning() -> None:
     rng = np.random.default_rng(0)
     frames = list(office().extrinsics)
     pose = office().odometry[0].pose
@@ -274,12 +274,12 @@ def test_a_robot_that_stands_is_no_fault() -> None:
         for k in range(100)
         for n, frame in enumerate(frames)
     ]
-    assert told(Messages(office().extrinsics, odometry, ranges)) == []
+    assert warnings_of(Messages(office().extrinsics, odometry, ranges)) == []
 
 
 @pytest.mark.slow
-def test_the_cost_depends_on_neither_length_nor_range() -> None:
-    """Each bound is a multiple of what it takes, in processor time."""
+def test_processor_time_is_independent_of_length_and_range() -> None:
+    """Each limit is a multiple of the usual processor time."""
     recording = building_drive(0, 1, NOISY, True, front_array())
     r, extrinsics = recording.readings, dict(recording.extrinsics)
 
@@ -299,8 +299,8 @@ def test_the_cost_depends_on_neither_length_nor_range() -> None:
     assert cost(often) < 4 * usual
 
 
-def test_all_sensors_bad() -> None:
-    """Ranges that have nothing to do with the walls, of every sensor: none of them stands out from the others."""
+def test_random_ranges_of_all_sensors_give_a_quality_warning() -> None:
+    """If the ranges of all sensors are random, no sensor differs from the others."""
     recording = building_drive(0, 1, NOISY, True, front_array())
     r = recording.readings
     random = dataclasses.replace(r, z=np.random.default_rng(0).uniform(0.2, 1.0, len(r)) * r.z_max)

@@ -1,4 +1,4 @@
-"""Input that gives a wrong map without an error: warned of with cause and remedy, and sound drives never."""
+"""Warnings about input that gives a wrong map without an error, with cause and remedy; correct drives give none."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ class Messages(NamedTuple):
 
 @lru_cache(maxsize=1)
 def drive() -> Messages:
-    """Along a corridor and back with eight sonars."""
+    """A drive along a corridor and back with eight sonars."""
     recording = corridor_drive(0, 1, NOISY, True, front_array())
     return Messages(dict(recording.extrinsics), list(recording.odometry), list(recording.ranges))
 
@@ -45,7 +45,7 @@ def in_a_room(x: float, y: float, yaw: float) -> float:
 
 @lru_cache(maxsize=1)
 def circling() -> Messages:
-    """Round and round in a room of 8 by 6 metres, for a minute."""
+    """A robot that drives in circles in a room of 8 by 6 metres, for a minute."""
     rng = np.random.default_rng(1)
     yaws = np.arange(8) * math.pi / 4
     extrinsics = {f'sonar_{n}': Pose2(0.0, 0.0, float(yaw)) for n, yaw in enumerate(yaws)}
@@ -60,8 +60,8 @@ def circling() -> Messages:
     return Messages(extrinsics, odometry, ranges)
 
 
-def told(messages: Messages) -> list[str]:
-    """What is said of a drive, node and offline alike."""
+def warnings_of(messages: Messages) -> list[str]:
+    """The warnings about a drive, of the node and offline."""
     associator = associated(*messages)
     return [*associator.limits.warnings(), *input_warnings(associator.readings)]
 
@@ -79,7 +79,7 @@ def twice() -> Messages:
 
 
 def one_frame(apart: int, given: Messages | None = None) -> Messages:
-    """All sensors in one frame, `apart` nanoseconds between two of a sweep."""
+    """The drive with all sensors in one frame, and `apart` nanoseconds between two sensors in a sweep."""
     given = given or drive()
     frames = list(given.extrinsics)
     return given._replace(
@@ -89,14 +89,14 @@ def one_frame(apart: int, given: Messages | None = None) -> Messages:
 
 
 def standing(part: float) -> Messages:
-    """Odometry that stands still from a part of the drive on."""
+    """Odometry that stands still after a part of the drive."""
     odometry = circling().odometry
     stop = odometry[int(part * (len(odometry) - 1))]
     return circling()._replace(odometry=[m if m.stamp < stop.stamp else m._replace(pose=stop.pose) for m in odometry])
 
 
 def moved_by(factor: float) -> Messages:
-    """Odometry in another unit than metres."""
+    """Odometry in other units than metres."""
     odometry = [m._replace(pose=m.pose._replace(x=m.pose.x * factor, y=m.pose.y * factor)) for m in circling().odometry]
     return circling()._replace(odometry=odometry)
 
@@ -107,7 +107,7 @@ def stuck(frame: int, value: float) -> Messages:
 
 
 def astray(seconds: float) -> Messages:
-    """Odometry that is 300 m away for some seconds, after a gap in which a robot might have driven so far."""
+    """Odometry that is 300 m away for some seconds, after a gap in which a robot could have driven this distance."""
     begin = drive().odometry[0].stamp + 40_000_000_000
     back = begin + round(seconds * 1e9)
     odometry = [
@@ -119,7 +119,7 @@ def astray(seconds: float) -> Messages:
 
 
 def far_echo() -> Messages:
-    """Sound ranges in a room, of a sensor that states a limit of 90 m, and one echo that comes near it."""
+    """Correct ranges in a room, from a sensor with a stated limit of 90 m, and one echo near it."""
     one = circling().ranges[2000]
     near = circling().with_ranges(lambda m: m._replace(range=min(m.range, 4.5 + m.stamp % 700_000_000 / 2e9)))
     return near.with_ranges(
@@ -129,13 +129,13 @@ def far_echo() -> Messages:
     )
 
 
-def own_silence(value: float) -> Messages:
-    """A driver that sends a range of its own below max_range where there is no echo."""
+def own_no_echo_value(value: float) -> Messages:
+    """A driver that sends a constant range below max_range if there is no echo."""
     return drive().with_ranges(lambda m: m._replace(range=min(m.range, value)))
 
 
 def stamped(change: Callable[[int], int]) -> Messages:
-    """Stamps that a driver fills in wrongly, of ranges and odometry alike."""
+    """Wrong stamps of a driver, for both ranges and odometry."""
     ranges = [m._replace(stamp=change(m.stamp)) for m in circling().ranges]
     return circling()._replace(ranges=ranges, odometry=[m._replace(stamp=change(m.stamp)) for m in circling().odometry])
 
@@ -182,10 +182,10 @@ SCENARIOS: dict[str, tuple[Callable[[], Messages], str]] = {
         r'no echo is from beyond.*does the sensor reach that far.*set the parameter max_range',
     ),
     'no echo is 3 m, max_range 5 m': (
-        lambda: own_silence(3.0),
+        lambda: own_no_echo_value(3.0),
         r'of the echoes are at 3\.000 m.*if there is no echo.*set the parameter max_range to 2\.9,',
     ),
-    'no echo is a float below max_range': (lambda: own_silence(4.9999995), r'of the echoes are at 5\.000 m'),
+    'no echo is a float below max_range': (lambda: own_no_echo_value(4.9999995), r'of the echoes are at 5\.000 m'),
     'no echo is min_range': (
         lambda: drive().with_ranges(lambda m: m._replace(range=m.min_range if m.range >= m.max_range else m.range)),
         r'of the echoes are at 0\.100 m.*if there is no echo\? Let it send \+inf',
@@ -228,9 +228,9 @@ SCENARIOS: dict[str, tuple[Callable[[], Messages], str]] = {
 
 
 @pytest.mark.parametrize('name', sorted(SCENARIOS))
-def test_wrong_input_is_warned_of(name: str) -> None:
+def test_wrong_input_gives_one_warning_with_the_cause(name: str) -> None:
     make, expected = SCENARIOS[name]
-    warnings = told(make())
+    warnings = warnings_of(make())
     assert any(re.search(expected, warning) for warning in warnings), warnings
     assert len(warnings) == 1, f'one cause, one warning: {warnings}'
 
@@ -238,7 +238,7 @@ def test_wrong_input_is_warned_of(name: str) -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize('noise', [NOISY, NOISE_FREE])
 @pytest.mark.parametrize('sonars', [front_array, sonar_ring])
-def test_no_alarm_in_the_simulated_worlds(noise: object, sonars: Callable[[], SonarArray]) -> None:
+def test_simulated_worlds_give_no_warning(noise: object, sonars: Callable[[], SonarArray]) -> None:
     for seed in range(3):
         for recording in (
             *(door_drive(seen, noise, seed, sonars()) for seen in (1, 3, 16)),
@@ -246,7 +246,7 @@ def test_no_alarm_in_the_simulated_worlds(noise: object, sonars: Callable[[], So
             *([building_drive(seed, 1, noise, noise is NOISY, sonars())] if not seed else []),
         ):
             # ten poses a second
-            assert told(Messages(dict(recording.extrinsics), recording.odometry[::5], recording.ranges)) == []
+            assert warnings_of(Messages(dict(recording.extrinsics), recording.odometry[::5], recording.ranges)) == []
 
 
 def test_few_readings_may_have_a_period_at_random() -> None:
@@ -270,7 +270,7 @@ def test_few_readings_may_have_a_period_at_random() -> None:
 
 @pytest.mark.parametrize('odometry', ['/odom', '/odom_corrected'])
 @pytest.mark.parametrize('name', ['office_a', 'office_b', 'building_a', 'building_b', 'building_c'])
-def test_no_alarm_on_the_recordings(shared: Path, name: str, odometry: str) -> None:
+def test_real_recordings_give_no_warning(shared: Path, name: str, odometry: str) -> None:
     from forward_grid_mapper.recordings.read_drive import read_drive
 
     bag = shared / 'data' / name / 'bag'
@@ -281,7 +281,7 @@ def test_no_alarm_on_the_recordings(shared: Path, name: str, odometry: str) -> N
     assert input_warnings(found.associator.readings) == []
 
 
-def test_the_reach_of_a_sensor_is_not_judged_from_one_place() -> None:
+def test_largest_ranges_from_one_place_give_no_warning() -> None:
     """Six of eight sensors see walls at 1 m, two look along a corridor."""
     rng = np.random.default_rng(0)
     frames, pose = list(drive().extrinsics), drive().odometry[0].pose
@@ -291,11 +291,11 @@ def test_the_reach_of_a_sensor_is_not_judged_from_one_place() -> None:
         for k in range(300)
         for n, frame in enumerate(frames)
     ]
-    assert told(Messages(drive().extrinsics, odometry, ranges)) == []
+    assert warnings_of(Messages(drive().extrinsics, odometry, ranges)) == []
 
 
-def test_a_robot_that_stands_while_people_walk_is_no_fault() -> None:
-    """Two of eight sensors see somebody come near; the others see the same as before."""
+def test_robot_at_standstill_with_people_gives_no_warning() -> None:
+    """Two of eight sensors see a person approach; the others have constant ranges."""
     rng = np.random.default_rng(0)
     frames = list(drive().extrinsics)
     pose = drive().odometry[0].pose
@@ -312,17 +312,17 @@ def test_a_robot_that_stands_while_people_walk_is_no_fault() -> None:
         for k in range(600)
         for n, frame in enumerate(frames)
     ]
-    assert told(Messages(drive().extrinsics, odometry, ranges)) == []
+    assert warnings_of(Messages(drive().extrinsics, odometry, ranges)) == []
 
 
-def test_no_alarm_where_a_robot_circles() -> None:
-    assert told(circling()) == []
+def test_robot_that_drives_in_circles_gives_no_warning() -> None:
+    assert warnings_of(circling()) == []
 
 
 @pytest.mark.parametrize('swings', [False, True])
 @pytest.mark.parametrize('steps', [5, 10, 16, 25, 32])
-def test_a_sensor_that_turns_sees_the_same_again_and_again(steps: int, swings: bool) -> None:
-    """On a robot that turns on the spot all the time, or that looks to the left and to the right as a servo does."""
+def test_repeated_ranges_of_a_turning_sensor_give_no_warning(steps: int, swings: bool) -> None:
+    """On a robot that turns on the spot all the time, or on a servo that turns to the left and to the right."""
     rng, odometry, ranges = np.random.default_rng(2), [], []
     for k in range(600):
         part = k % steps / steps
@@ -330,47 +330,52 @@ def test_a_sensor_that_turns_sees_the_same_again_and_again(steps: int, swings: b
         odometry.append(OdometryMessage(k * 100_000_000, 'odom', 'base_link', Pose2(2.5, 1.5, yaw)))
         z = in_a_room(2.5, 1.5, yaw) + rng.normal(0, 0.02)
         ranges.append(RangeMessage(k * 100_000_000, 'sonar', z, 0.1, 8.0, 0.26))
-    assert told(Messages({'sonar': Pose2(0.0, 0.0, 0.0)}, odometry, ranges)) == []
+    assert warnings_of(Messages({'sonar': Pose2(0.0, 0.0, 0.0)}, odometry, ranges)) == []
 
 
-def test_few_readings_say_nothing() -> None:
+def test_few_readings_give_no_warning() -> None:
     few = drive()._replace(ranges=twice().ranges[:28])
-    assert told(few) == []
+    assert warnings_of(few) == []
 
 
-def test_what_a_driver_sends_for_no_echo_is_no_fault() -> None:
+def test_value_above_max_range_for_no_echo_gives_no_warning() -> None:
     for value in (5.11, 6.5535, 65.535, 99.0):
-        assert told(drive().with_ranges(lambda m, v=value: m._replace(range=v) if m.range >= m.max_range else m)) == []
+        assert (
+            warnings_of(drive().with_ranges(lambda m, v=value: m._replace(range=v) if m.range >= m.max_range else m))
+            == []
+        )
 
 
-def test_echoes_of_fixed_distance_rangers_are_no_fault() -> None:
-    """REP 117: -inf is an echo somewhere below max_range, which is mapped as half of it."""
+def test_fixed_distance_rangers_give_no_warning() -> None:
+    """REP 117: -inf is an echo below max_range, which is mapped at half of it."""
 
     def fixed(m: RangeMessage) -> RangeMessage:
         return m._replace(range=-math.inf if m.range < 1.5 else math.inf, min_range=1.5, max_range=1.5)
 
-    assert told(drive().with_ranges(fixed)) == []
+    assert warnings_of(drive().with_ranges(fixed)) == []
 
 
-def test_a_sensor_that_hears_the_robot_is_no_silence() -> None:
-    """One that answers min_range all the time, in whatever direction it looks; it has a verdict of its own."""
+def test_sensor_that_sees_the_robot_gives_no_warning_of_no_echo() -> None:
+    """The sensor returns min_range in all directions, which has its own verdict."""
     frame = next(iter(circling().extrinsics))
     near = circling().with_ranges(lambda m: m._replace(range=0.1 if m.frame_id == frame and m.stamp % 7 else m.range))
-    assert not [text for text in told(near) if 'if there is no echo' in text]
+    assert not [text for text in warnings_of(near) if 'if there is no echo' in text]
 
 
-def test_a_variance_that_ranges_may_have_is_no_fault() -> None:
-    assert told(drive().with_ranges(lambda m: m._replace(variance=0.04))) == []
+def test_plausible_variance_gives_no_warning() -> None:
+    assert warnings_of(drive().with_ranges(lambda m: m._replace(variance=0.04))) == []
 
 
-def test_a_wall_that_is_far_and_always_as_far_is_no_silence() -> None:
-    """A robot that stands for long, with ranges in centimetres; and one that drives to and fro beside a wall."""
+def test_wall_at_a_constant_distance_gives_no_warning_of_no_echo() -> None:
+    """A robot at standstill for long, with ranges in centimetres, and one that drives to and fro along a wall."""
     rounded = circling().with_ranges(lambda m: m._replace(range=round(min(m.range, 4.5), 2), max_range=4.5))
     last = rounded.odometry[-1]
     poses = [last._replace(stamp=last.stamp + k * 100_000_000) for k in range(1, 3000)]
     farthest = [m._replace(range=4.4) for m in rounded.ranges[-len(rounded.extrinsics) :]]
     ranges = [m._replace(stamp=pose.stamp) for pose in poses for m in farthest]
-    assert not [text for text in told(Messages(rounded.extrinsics, poses, ranges)) if 'if there is no echo' in text]
+    assert not [
+        text for text in warnings_of(Messages(rounded.extrinsics, poses, ranges)) if 'if there is no echo' in text
+    ]
 
     at_the_side = {'left': Pose2(0.0, 0.0, math.pi / 2)}
     beside = [Pose2(min(k, 200 - k) * 0.1, 0.0, 0.0) for k in range(200)]
@@ -378,9 +383,9 @@ def test_a_wall_that_is_far_and_always_as_far_is_no_silence() -> None:
     ranges = [
         RangeMessage(k * 250_000_000, 'left', round(1.5 + 0.01 * math.sin(k), 2), 0.1, 4.0, 0.26) for k in range(400)
     ]
-    assert not [text for text in told(Messages(at_the_side, poses, ranges)) if 'if there is no echo' in text]
+    assert not [text for text in warnings_of(Messages(at_the_side, poses, ranges)) if 'if there is no echo' in text]
 
 
-def test_one_reading_at_each_whole_second_is_no_fault() -> None:
+def test_readings_at_whole_seconds_give_no_warning() -> None:
     seldom = circling()._replace(ranges=[m for m in circling().ranges if m.stamp % SECOND == 0])
-    assert told(seldom) == []
+    assert warnings_of(seldom) == []

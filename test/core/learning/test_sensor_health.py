@@ -1,4 +1,4 @@
-"""The table of sensors names those that are broken, and no others."""
+"""The table of sensors: broken sensors are named, and no others."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ def rooms(front: bool = False) -> Readings:
 
 
 def broken(readings: Readings, random: int, dead: int, body: int) -> Readings:
-    """The same with one sensor that makes up its ranges, one that hears nothing, and one that hears the robot."""
+    """The readings with one sensor with random ranges, one without echoes, and one that sees the robot."""
     rng = np.random.default_rng(1)
     z = readings.z.copy()
     z = np.where(readings.sensor == random, rng.uniform(0.1, readings.z_max), z)
@@ -55,7 +55,7 @@ def suspects(readings: Readings) -> dict[str, str]:
 
 
 @pytest.mark.parametrize('numbers', [(3, 8, 15), (0, 6, 18), (20, 1, 12)])
-def test_exactly_the_broken_sensors_of_a_ring_are_named(numbers: tuple[int, int, int]) -> None:
+def test_only_the_broken_sensors_of_a_ring_are_named(numbers: tuple[int, int, int]) -> None:
     random, dead, body = (f'sonar_{k:02d}' for k in numbers)
     table = sensor_health(mapped(broken(rooms(), *numbers)))
     assert {name: row.verdict for name, row in table.items() if row.verdict != 'ok'} == {
@@ -71,23 +71,23 @@ def test_exactly_the_broken_sensors_of_a_ring_are_named(numbers: tuple[int, int,
 
 
 @pytest.mark.parametrize('numbers', [(1, 5, 0), (7, 0, 4)])
-def test_a_body_that_the_map_believes_is_found_by_the_others(numbers: tuple[int, int, int]) -> None:
+def test_sensor_that_sees_the_robot_is_found_by_comparison(numbers: tuple[int, int, int]) -> None:
     found = suspects(broken(rooms(front=True), *numbers))
     assert list(found) == sorted(f'sonar_{k:02d}' for k in numbers)
     assert found[f'sonar_{numbers[2]:02d}'] == 'always short'
 
 
-def test_sound_sensors_are_ok() -> None:
+def test_correct_sensors_are_ok() -> None:
     table = sensor_health(mapped(rooms()))
     assert {row.verdict for row in table.values()} == {'ok'}
     assert health_warning(table) == ''
     assert all(row.random < 0.2 for row in table.values())
 
 
-def test_neither_smooth_walls_nor_a_follower_are_a_sensors_fault() -> None:
+def test_smooth_walls_and_a_follower_give_no_warning() -> None:
     table = sensor_health(mapped(corridor_drive(0).readings))
     assert health_warning(table) == ''
-    # behind the robot
+    # sensors at the back of the robot
     assert 'something moves near it' in {table[f'sonar_{k:02d}'].verdict for k in (11, 12, 13)}
 
 
@@ -95,8 +95,8 @@ def test_neither_smooth_walls_nor_a_follower_are_a_sensors_fault() -> None:
     ('silent', 'random', 'verdict'),
     [(970, 5, 'ok'), (970, 25, 'never hears anything'), (1000, 0, 'never hears anything')],
 )
-def test_a_sensor_hears_if_the_map_explains_its_few_echoes(silent: int, random: int, verdict: str) -> None:
-    """A robot may stand for hours where one of its sensors does not hear the wall before it."""
+def test_sensor_with_few_echoes_is_ok_if_the_map_explains_them(silent: int, random: int, verdict: str) -> None:
+    """A robot may pause for hours where one of its sensors gets no echo of the wall in front of it."""
     ranges = np.zeros((3, 400), np.int64)
     ranges[:, 10], ranges[:, 30] = 1, [1000 - silent, 900, 900]
     counts = {
@@ -111,14 +111,14 @@ def test_a_sensor_hears_if_the_map_explains_its_few_echoes(silent: int, random: 
     assert [row.verdict for row in table.values()] == [verdict, 'ok', 'ok']
 
 
-def test_few_readings_are_not_judged() -> None:
+def test_sensor_with_few_readings_has_no_verdict() -> None:
     readings = broken(rooms(), 3, 8, 15)
     rare = readings.select((readings.sensor != 8) | (np.arange(len(readings)) < 300))
     table = sensor_health(mapped(rare))
     assert table['sonar_08'].verdict == 'few readings' and not table['sonar_08'].suspect
 
 
-def test_names_without_readings_and_sensors_alone() -> None:
+def test_sensors_without_readings_and_a_single_sensor() -> None:
     readings = rooms().select(rooms().sensor == 5)
     table = sensor_health(mapped(readings))
     assert table['sonar_04'].verdict == 'few readings' and math.isnan(table['sonar_04'].random)
@@ -128,7 +128,7 @@ def test_names_without_readings_and_sensors_alone() -> None:
     assert sensor_health(mapped(alone))['only'].verdict == 'ok'
 
 
-def test_first_obstacles() -> None:
+def test_distance_of_first_obstacles() -> None:
     grid = Grid(0.1, -5, -10, 60, 20)
     ml = np.full(grid.shape, -1, np.int8)
     rows, columns = grid.cells_of(np.array([2.05]), np.array([0.05]))
@@ -147,13 +147,13 @@ def test_first_obstacles() -> None:
 
 @settings(max_examples=40, deadline=None)
 @given(st.integers(0, 2**32 - 1), st.floats(0.02, 1.5))
-def test_posts_of_one_cell_are_always_found(seed: int, half_angle: float) -> None:
+def test_posts_of_one_cell_are_found(seed: int, half_angle: float) -> None:
     rng = np.random.default_rng(seed)
     grid = Grid(0.1, -30, -20, 60, 50)
     ml = np.zeros(grid.shape, np.int8)
     x, y, yaw = rng.uniform(-0.5, 0.5), rng.uniform(-0.5, 0.5), rng.uniform(-4, 4)
     away, side = rng.uniform(0.3, 1.9), rng.uniform(-0.99, 0.99) * half_angle
-    # the cell that has a point of the cone in it, if its centre is in the cone too
+    # the cell that contains a point of the cone, if its centre is in the cone as well
     rows, columns = grid.cells_of(np.array([x + away * np.cos(yaw + side)]), np.array([y + away * np.sin(yaw + side)]))
     ml[rows, columns] = 1
     readings = Readings.from_columns(x=x, y=y, yaw=yaw, z=2.5, z_max=2.5, half_angle=half_angle)
@@ -167,7 +167,7 @@ def test_posts_of_one_cell_are_always_found(seed: int, half_angle: float) -> Non
         assert np.isfinite(found)
 
 
-def test_the_largest_number_as_range_ends() -> None:
+def test_ray_with_the_largest_float_as_range_ends() -> None:
     grid = Grid(0.1, -5, -10, 60, 20)
     ml = np.zeros(grid.shape, np.int8)
     rows, columns = grid.cells_of(np.array([5.45, 0.55]), np.array([0.05, -0.95]))
@@ -183,7 +183,7 @@ def test_the_largest_number_as_range_ends() -> None:
     assert found[3] == pytest.approx(1e6 + 5.45 - 0.03, abs=1e-3)
 
 
-def test_commonest_range() -> None:
+def test_most_frequent_range() -> None:
     count, middle = commonest_range(np.array([1.0, 3.05, 3.0, 3.1, 5.0]))
     assert (count, middle) == (3, pytest.approx(3.05))
     assert commonest_range(np.empty(0))[0] == 0

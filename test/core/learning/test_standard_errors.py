@@ -1,4 +1,4 @@
-"""Standard errors against what they promise: that the truth lies within them as often as they say."""
+"""Standard errors of learned parameters: the share of true values within them is as stated."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def learned(readings: Readings, start: ModelParameters = START) -> dict[str, Est
     return estimates(forward.at(settle(forward, line_map())), line_map())
 
 
-def test_the_truth_lies_within_the_intervals_as_often_as_they_say() -> None:
+def test_intervals_contain_the_true_values_in_95_per_cent() -> None:
     rng = np.random.default_rng(3)
     drives, within, distances = 120, dict.fromkeys(LEARNED, 0), {name: [] for name in LEARNED}
     for _ in range(drives):
@@ -33,7 +33,7 @@ def test_the_truth_lies_within_the_intervals_as_often_as_they_say() -> None:
             distances[name].append((found.value - truth) / found.error)
     for name in LEARNED:
         assert within[name] >= 0.89 * drives, within
-        # nor are they larger than they need to be
+        # they are not larger than needed either
         assert 0.7 < np.std(distances[name]) < 1.3, name
         assert abs(np.mean(distances[name])) < 0.35, name
 
@@ -50,22 +50,22 @@ def test_estimating_functions_are_derivatives_of_the_log_likelihood(name: str) -
         for d in (step, -step)
     )
     expected = (high - low) / (2 * step)
-    # without an echo, the normal around max range is no evidence of sigma
+    # without an echo, the normal density around max range gives no evidence about sigma
     counts = readings.echo & (readings.z < 5.5) if name == 'sigma' else np.ones(len(readings), bool)
     found = estimating_functions(ForwardModel(readings, LINE, model), line_map())[name]
     np.testing.assert_allclose(found[counts], expected[counts], rtol=1e-4, atol=1e-4)
 
 
-def test_they_vanish_where_the_updates_end() -> None:
+def test_estimating_functions_vanish_at_the_learned_values() -> None:
     readings = drawn(np.random.default_rng(5), 2000)
     model = settle(ForwardModel(readings, LINE, START), line_map())
     for name, found in estimates(ForwardModel(readings, LINE, model), line_map()).items():
-        told = estimating_functions(ForwardModel(readings, LINE, model), line_map())[name]
-        total, spread = told.sum(), told.std() * math.sqrt(len(readings))
+        actual = estimating_functions(ForwardModel(readings, LINE, model), line_map())[name]
+        total, spread = actual.sum(), actual.std() * math.sqrt(len(readings))
         assert abs(total) < 0.1 * spread, (name, found)
 
 
-def test_readings_that_repeat_one_another_do_not_make_it_surer() -> None:
+def test_repeated_readings_do_not_reduce_the_error() -> None:
     readings = drawn(np.random.default_rng(6), 600, repeat=1)
     repeated = drawn(np.random.default_rng(6), 600, repeat=16)
     for name in LEARNED:
@@ -73,7 +73,7 @@ def test_readings_that_repeat_one_another_do_not_make_it_surer() -> None:
         assert 0.6 * once < often < 1.7 * once, name
 
 
-def test_the_order_of_readings_does_not_matter() -> None:
+def test_error_does_not_depend_on_the_order_of_readings() -> None:
     rng = np.random.default_rng(7)
     readings = drawn(rng, 500, repeat=4)
     shuffled = readings.select(rng.permutation(len(readings)))
@@ -81,7 +81,7 @@ def test_the_order_of_readings_does_not_matter() -> None:
         assert learned(shuffled)[name].error == pytest.approx(learned(readings)[name].error, rel=1e-6)
 
 
-def test_more_readings_are_surer() -> None:
+def test_more_readings_reduce_the_error() -> None:
     rng = np.random.default_rng(8)
     few, many = learned(drawn(rng, 500)), learned(drawn(rng, 8000))
     for name in LEARNED:
@@ -89,7 +89,7 @@ def test_more_readings_are_surer() -> None:
         assert few[name].readings < many[name].readings
 
 
-def test_values_that_cannot_move_say_why() -> None:
+def test_values_that_cannot_be_learned_have_a_reason() -> None:
     rng = np.random.default_rng(9)
     readings = drawn(rng, 500, dataclasses.replace(TRUTH, p_lost=0.0, sigma=0.02))
     found = learned(readings, dataclasses.replace(START, p_lost=0.0))

@@ -1,4 +1,4 @@
-"""Why a cell is what it is, against evaluations of whole maps by all readings."""
+"""Evidence of single cells (`explain`), compared with evaluations of whole maps by all readings."""
 
 from __future__ import annotations
 
@@ -19,14 +19,14 @@ from samples import random_readings
 AREA = Grid(0.1, -8, -5, 26, 20)
 
 
-def asked(maps: MapSet, row: int, column: int) -> CellEvidence:
+def evidence_at(maps: MapSet, row: int, column: int) -> CellEvidence:
     x, y = (float(values[k]) for values, k in zip(maps.grid.centers(), (column, row), strict=True))
     return cell_evidence(maps.readings, maps.grid, maps.ml, maps.parameters, maps.normals, (x, y))
 
 
 @pytest.mark.parametrize('seed', range(6))
 @pytest.mark.parametrize('exponent', [1.0, 0.4])
-def test_what_readings_say_is_the_difference_of_two_maps(seed: int, exponent: float) -> None:
+def test_nats_of_each_reading_are_the_difference_of_two_maps(seed: int, exponent: float) -> None:
     rng = np.random.default_rng(seed)
     readings = random_readings(rng, AREA, 150, z_max=1.5)
     maps = Mapper(Parameters().varied({'likelihood_exponent': exponent, 'end_cost': 0.05, 'prior': 0.5})).run(readings)
@@ -41,14 +41,14 @@ def test_what_readings_say_is_the_difference_of_two_maps(seed: int, exponent: fl
     assert len(walls) > 0
     for cell in [*rng.choice(cells, 12), *rng.choice(walls, 4)]:
         row, column = divmod(int(cell), maps.grid.width)
-        found = asked(maps, row, column)
+        found = evidence_at(maps, row, column)
         assert (found.row, found.column) == (row, column)
         with_it, without = occupied.copy(), occupied.copy()
         with_it[row, column], without[row, column] = 1, 0
         expected = exponent * (likelihoods(with_it) - likelihoods(without))
-        told = np.zeros(len(maps.readings))
-        told[found.readings] = found.nats
-        assert told == pytest.approx(np.where(np.abs(expected) > NOTHING, expected, 0.0), abs=1e-8)
+        actual = np.zeros(len(maps.readings))
+        actual[found.readings] = found.nats
+        assert actual == pytest.approx(np.where(np.abs(expected) > NOTHING, expected, 0.0), abs=1e-8)
         assert found.data == pytest.approx(expected.sum(), abs=1e-6)
         assert (np.diff(np.abs(found.nats)) <= 0).all()
         nothing = without.copy()
@@ -65,10 +65,10 @@ def wall_ahead(z: list[float]) -> MapSet:
     return Mapper(Parameters()).run(readings)
 
 
-def test_readings_are_told_apart_by_where_they_end() -> None:
+def test_readings_are_classified_by_where_they_end() -> None:
     maps = wall_ahead([1.0] * 6 + [1.6, 2.0])
     row = -maps.grid.row
-    found = asked(maps, row, 10 - maps.grid.column)
+    found = evidence_at(maps, row, 10 - maps.grid.column)
     assert found.ends_here.sum() == 6
     assert found.silent.sum() == 1
     assert (found.nats[found.ends_here] > 0).all()
@@ -77,23 +77,23 @@ def test_readings_are_told_apart_by_where_they_end() -> None:
     assert not found.traversed
 
 
-def test_readings_that_went_through_a_wall_say_so() -> None:
+def test_readings_that_passed_a_wall_are_marked() -> None:
     maps = wall_ahead([1.0] * 6 + [1.6, 2.0])
     for column, behind in ((5, False), (10, False), (12, False), (16, True)):
-        found = asked(maps, -maps.grid.row, column - maps.grid.column)
+        found = evidence_at(maps, -maps.grid.row, column - maps.grid.column)
         assert len(found.readings)
         assert (found.through_wall == behind).all()
 
 
-def test_a_cell_that_a_sensor_was_moved_over_says_so() -> None:
+def test_cell_below_the_path_of_a_sensor_is_marked_as_traversed() -> None:
     maps = wall_ahead([1.0] * 6)
-    assert asked(maps, -maps.grid.row, -maps.grid.column).traversed
+    assert evidence_at(maps, -maps.grid.row, -maps.grid.column).traversed
 
 
-def test_the_prior_is_that_of_its_neighbours() -> None:
+def test_prior_of_a_cell_depends_on_its_neighbours() -> None:
     maps = wall_ahead([1.0] * 6)
     alone = Parameters().search
     ml = np.full(maps.grid.shape, 0, np.int8)
-    told = cell_evidence(maps.readings, maps.grid, ml, maps.parameters, maps.normals, (1.05, 0.05))
-    assert told.prior == pytest.approx(-2 * alone.end_cost - alone.wall_cost * 0.1)
-    assert math.isfinite(told.data)
+    actual = cell_evidence(maps.readings, maps.grid, ml, maps.parameters, maps.normals, (1.05, 0.05))
+    assert actual.prior == pytest.approx(-2 * alone.end_cost - alone.wall_cost * 0.1)
+    assert math.isfinite(actual.data)

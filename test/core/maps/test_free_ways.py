@@ -1,4 +1,4 @@
-"""What sound came to on a free way: mirror images behind walls, and free space that nothing passed."""
+"""Mirror images behind walls, and free space that no reading passed."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def made(readings: Readings, occupied: np.ndarray, **options: object) -> Evidenc
 
 
 def some(seed: int, filled: float = 0.08) -> tuple[Readings, np.ndarray]:
-    """Readings off the lattice, so that no way leads through a corner of cells, and a map."""
+    """A random map, and readings that are not on the lattice, so that none passes a corner of cells."""
     rng = np.random.default_rng(seed)
     readings = random_readings(rng, GRID, 60, z_max=2.0)
     readings.x[:] += 0.00123
@@ -48,9 +48,9 @@ def test_echoes_and_passes_are_those_of_the_twin(seed: int) -> None:
     assert np.abs(echoes * UNIT - expected).max() < 1e-4
     assert 0 < expected[0].sum() < expected[1].sum()
     free = ~occupied.reshape(GRID.shape)
-    told = not_passed(evidence, free)
-    assert np.array_equal(told, naive.never_passed(readings, GRID, occupied, MODEL, free))
-    assert 0 < told.sum() < free.sum()
+    actual = not_passed(evidence, free)
+    assert np.array_equal(actual, naive.never_passed(readings, GRID, occupied, MODEL, free))
+    assert 0 < actual.sum() < free.sum()
     twice = made(readings, occupied)
     twice.add_multiplicity(np.arange(len(readings)))
     doubled = np.zeros_like(echoes)
@@ -58,18 +58,18 @@ def test_echoes_and_passes_are_those_of_the_twin(seed: int) -> None:
     assert np.abs(doubled - 2 * echoes).max() <= len(readings)
 
 
-def test_a_mirror_image_is_what_few_echoes_around_came_to_on_a_free_way() -> None:
+def test_mirror_images_are_cells_whose_echoes_had_no_free_path() -> None:
     seen = 0
     for seed in range(6):
         readings, occupied = some(seed, 0.12)
         cells = np.random.default_rng(seed).random(GRID.shape) < 0.5
-        told = mirror_images(made(readings, occupied), cells)
-        assert np.array_equal(told, naive.mirror_images(readings, GRID, occupied, MODEL, cells))
-        seen += told.sum()
+        actual = mirror_images(made(readings, occupied), cells)
+        assert np.array_equal(actual, naive.mirror_images(readings, GRID, occupied, MODEL, cells))
+        seen += actual.sum()
     assert seen > 20
 
 
-def test_threads_change_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_number_of_threads_does_not_change_mirror_images(monkeypatch: pytest.MonkeyPatch) -> None:
     readings, occupied = some(1, 0.15)
     one = mirror_images(made(readings, occupied), EVERYWHERE)
     monkeypatch.setattr(threads, 'LEAST_PART', 20)
@@ -78,7 +78,9 @@ def test_threads_change_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def along_a_mirror() -> Readings:
-    """A robot between a smooth wall at y = 2 and a rough one at y = 0, which beams at a slant hear in the mirror."""
+    """A robot between a smooth wall at y = 2, which mirrors beams at large incidence angles, and a
+    rough one at y = 0.
+    """
     x, yaw = (values.ravel() for values in np.meshgrid(np.arange(0.5, 6.0, 0.05), np.radians(np.arange(-90, 91, 7.5))))
     up, away = yaw > 0, np.abs(np.sin(yaw))
     square = np.abs(np.abs(yaw) - math.pi / 2) < math.radians(20)
@@ -96,7 +98,7 @@ def along_a_mirror() -> Readings:
     )
 
 
-def test_what_is_heard_in_a_smooth_wall_is_not_mapped_behind_it() -> None:
+def test_mirror_image_behind_a_smooth_wall_is_not_mapped() -> None:
     maps = Mapper(Parameters()).run(along_a_mirror())
     xs, ys = maps.grid.centers()
     along = (xs > 1.0) & (xs < 5.0)
@@ -112,7 +114,7 @@ def test_what_is_heard_in_a_smooth_wall_is_not_mapped_behind_it() -> None:
     assert np.isnan(maps.uncertainty[behind & (maps.searched == 1)]).all()
 
 
-def test_a_wall_behind_a_wall_that_was_seen_from_its_own_side_stays() -> None:
+def test_wall_seen_from_its_own_side_is_no_mirror_image() -> None:
     drive = along_a_mirror()
     beyond = drive.select(drive.yaw < 0)
     beyond.y[:] += 2.0

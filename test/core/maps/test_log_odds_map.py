@@ -1,4 +1,4 @@
-"""The standard map against its plain twin, and the laws that the node relies on."""
+"""The standard map, compared with its twin in plain Python, and properties that the node relies on."""
 
 from __future__ import annotations
 
@@ -45,22 +45,22 @@ def test_log_odds_are_those_of_the_twin(arc: tuple[float, float], directions: in
 
 @pytest.mark.parametrize('half_angle', [1e-6, 0.02, 0.13, 0.6, 1.3, 1.55])
 @pytest.mark.parametrize('degrees', [0, 1e-9, 30, 45, 90, 135, 180, 200, 270, 359])
-def test_a_cone_along_the_lattice_has_the_cells_of_the_twin(half_angle: float, degrees: float) -> None:
+def test_cone_along_the_lattice_has_the_cells_of_the_twin(half_angle: float, degrees: float) -> None:
     live = LogOddsMap(Parameters())
     for x, y in ((0.05, 0.05), (0.031, 0.072)):
         live.clear()
         live.add(Readings.from_columns(x=x, y=y, yaw=math.radians(degrees), z=[1.43], z_max=2.0, half_angle=half_angle))
         pose = (x, y, math.radians(degrees))
-        # what lies on an edge may be in or out by rounding
+        # cells on an edge may be inside or outside, by rounding
         most = set(naive.cone_cells(pose, half_angle, 1.43 + ARC[1], live.grid, 1e-6))
         least = set(naive.cone_cells(pose, half_angle - 1e-9, 1.43 + ARC[1] - 1e-6, live.grid, -1e-6))
         known = set(np.flatnonzero(np.isfinite(live.log_odds())).tolist())
         assert least <= known <= most
 
 
-def test_readings_at_a_slant_leave_a_wall_that_others_meet_head_on() -> None:
+def test_readings_at_large_incidence_do_not_remove_a_wall() -> None:
     # a wall along y, 1 m before the sensor
-    def seen(directions: int) -> float:
+    def probability_of_wall(directions: int) -> float:
         live = LogOddsMap(Parameters().varied({'live_directions': directions}))
         beam = {'half_angle': 0.1, 'z_max': 5.0}
         live.add(Readings.from_columns(x=0.05, y=0.05, yaw=0.0, z=[1.0] * 3, **beam))
@@ -68,11 +68,11 @@ def test_readings_at_a_slant_leave_a_wall_that_others_meet_head_on() -> None:
         row, column = live.grid.cells_of(np.array(1.05), np.array(0.05))
         return float(live.probability()[row, column])
 
-    assert seen(1) < 0.01
-    assert seen(4) > 0.9
+    assert probability_of_wall(1) < 0.01
+    assert probability_of_wall(4) > 0.9
 
 
-def test_what_nobody_calls_occupied_is_as_free_as_all_readings_say() -> None:
+def test_cells_without_echo_are_the_same_for_any_number_of_directions() -> None:
     one, four = (LogOddsMap(Parameters().varied({'live_directions': n})) for n in (1, 4))
     yaw = np.linspace(0.0, 3.0, 9)
     readings = Readings.from_columns(x=0.05, y=0.05, yaw=yaw, z=np.full(9, 2.0), z_max=2.0, half_angle=0.6)
@@ -82,7 +82,7 @@ def test_what_nobody_calls_occupied_is_as_free_as_all_readings_say() -> None:
     assert np.nanmax(one.log_odds()) <= 0.0
 
 
-def test_a_long_arc_says_less_of_each_of_its_cells() -> None:
+def test_longer_arc_gives_less_evidence_for_each_cell() -> None:
     def on_axis(z: float) -> float:
         live = LogOddsMap(Parameters())
         live.add(Readings.from_columns(x=0.05, y=0.05, yaw=0.0, z=[z], z_max=9.0, half_angle=0.25))
@@ -95,20 +95,20 @@ def test_a_long_arc_says_less_of_each_of_its_cells() -> None:
         assert on_axis(z) == pytest.approx(whole * 0.2 / (2 * z * math.sin(0.25)), abs=1e-5)
 
 
-def test_the_weight_falls_with_the_sine_of_the_angle_from_the_axis_to_the_edge() -> None:
+def test_weight_decreases_with_the_sine_of_the_angle_to_the_axis() -> None:
     live = LogOddsMap(Parameters().varied({'live_p_free': 0.2}))
     live.add(Readings.from_columns(x=0.0, y=0.0, yaw=0.0, z=[4.0], z_max=5.0, half_angle=0.6))
     rows, columns = live.grid.cells_of(np.full(5, 3.05), np.array([0.05, 0.55, 1.05, 1.55, 2.05]))
     sines = np.sin(np.arctan2([0.05, 0.55, 1.05, 1.55, 2.05], 3.05))
-    told = live.log_odds()[rows, columns]
-    assert told == pytest.approx((1 - (sines / math.sin(0.6)) ** 2) * logit(0.2), abs=1e-6)
-    assert told[0] < told[1] < told[2] < told[3] < told[4] < 0
+    actual = live.log_odds()[rows, columns]
+    assert actual == pytest.approx((1 - (sines / math.sin(0.6)) ** 2) * logit(0.2), abs=1e-6)
+    assert actual[0] < actual[1] < actual[2] < actual[3] < actual[4] < 0
 
 
 @pytest.mark.parametrize('half_angle', [1e-6, 0.005, 0.02])
-def test_a_thin_cone_is_one_and_a_half_cells_wide(half_angle: float) -> None:
+def test_thin_cone_is_one_and_a_half_cells_wide(half_angle: float) -> None:
     live = LogOddsMap(Parameters().varied({'live_p_free': 0.2}))
-    # the axis leaves the centres of its cells by up to half a cell
+    # the distance of the axis from the centres of its cells is up to half a cell
     readings = Readings.from_columns(x=0.05, y=0.05, yaw=0.1, z=[3.0], z_max=5.0, half_angle=half_angle)
     live.add(readings)
     xs, ys = live.grid.centers()
@@ -121,7 +121,7 @@ def test_a_thin_cone_is_one_and_a_half_cells_wide(half_angle: float) -> None:
 
 
 @pytest.mark.parametrize('some', [random_readings, naive.awkward_readings])
-def test_the_order_and_the_batches_of_readings_do_not_matter(some: object) -> None:
+def test_map_does_not_depend_on_order_and_batches_of_readings(some: object) -> None:
     rng = np.random.default_rng(1)
     readings = some(rng, AREA, 200)
     whole = LogOddsMap(Parameters())
@@ -133,7 +133,7 @@ def test_the_order_and_the_batches_of_readings_do_not_matter(some: object) -> No
     assert np.array_equal(parts.log_odds(), whole.log_odds(), equal_nan=True)
 
 
-def test_probabilities_are_unknown_exactly_where_no_cone_reaches() -> None:
+def test_only_cells_of_cones_have_a_probability() -> None:
     readings = random_readings(np.random.default_rng(2), AREA, 1)
     live = LogOddsMap(Parameters())
     live.add(readings)
@@ -143,7 +143,7 @@ def test_probabilities_are_unknown_exactly_where_no_cone_reaches() -> None:
     assert set(np.flatnonzero(known).tolist()) == set(cells)
 
 
-def test_the_map_can_be_asked_for_on_a_larger_grid() -> None:
+def test_map_on_a_larger_grid_has_the_same_values() -> None:
     readings = random_readings(np.random.default_rng(3), AREA, 30)
     live = LogOddsMap(Parameters())
     live.add(readings)
@@ -152,7 +152,7 @@ def test_the_map_can_be_asked_for_on_a_larger_grid() -> None:
     assert np.isfinite(live.log_odds(wide)).sum() == np.isfinite(live.log_odds()).sum()
 
 
-def test_a_map_that_would_be_too_large_is_refused_and_nothing_changes() -> None:
+def test_map_above_max_cells_is_rejected_and_unchanged() -> None:
     live = LogOddsMap(Parameters().varied({'max_cells': 10_000}))
     near = random_readings(np.random.default_rng(4), AREA, 5, z_max=1.0)
     live.add(near)
@@ -164,7 +164,7 @@ def test_a_map_that_would_be_too_large_is_refused_and_nothing_changes() -> None:
     assert np.array_equal(live.log_odds(), before, equal_nan=True)
 
 
-def test_a_growth_without_memory_changes_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_growth_without_memory_leaves_the_map_unchanged(monkeypatch: pytest.MonkeyPatch) -> None:
     live = LogOddsMap(Parameters())
     near = random_readings(np.random.default_rng(4), AREA, 5, z_max=1.0)
     live.add(near)
@@ -178,7 +178,7 @@ def test_a_growth_without_memory_changes_nothing(monkeypatch: pytest.MonkeyPatch
     assert np.nanmax(np.abs(live.log_odds())) > np.nanmax(np.abs(before))
 
 
-def test_evidence_that_cancels_leaves_a_known_cell() -> None:
+def test_cell_with_log_odds_near_zero_is_known() -> None:
     live = LogOddsMap(Parameters().varied({'live_p_occupied': 0.8, 'live_p_free': 0.2}))
     both = Readings.from_columns(x=0.05, y=0.05, yaw=0.0, z=[1.0, 2.0], z_max=4.0, half_angle=0.1)
     live.add(both)
@@ -186,7 +186,7 @@ def test_evidence_that_cancels_leaves_a_known_cell() -> None:
     assert live.probability()[row, column] == pytest.approx(0.5, abs=0.02)
 
 
-def test_a_thin_beam_marks_the_cells_that_it_crosses() -> None:
+def test_thin_beam_updates_the_cells_that_it_crosses() -> None:
     live = LogOddsMap(Parameters())
     live.add(Readings.from_columns(x=0.05, y=0.02, yaw=0.0, z=[1.0] * 5, z_max=4.0, half_angle=0.005))
     row, column = live.grid.cells_of(np.array([0.55, 1.05]), np.array([0.05, 0.05]))
@@ -195,7 +195,7 @@ def test_a_thin_beam_marks_the_cells_that_it_crosses() -> None:
     assert occupied > 0.9
 
 
-def test_a_deep_arc_does_not_depend_on_the_order() -> None:
+def test_deep_arc_does_not_depend_on_the_order() -> None:
     rng = np.random.default_rng(5)
     readings = random_readings(rng, AREA, 40)
     maps = []
@@ -207,17 +207,17 @@ def test_a_deep_arc_does_not_depend_on_the_order() -> None:
     assert np.array_equal(*maps, equal_nan=True)
 
 
-def test_empty_map() -> None:
+def test_map_without_readings_has_no_cells() -> None:
     live = LogOddsMap(Parameters())
     live.add(random_readings(np.random.default_rng(0), AREA, 0))
     assert live.probability().shape == (0, 0)
 
 
 @pytest.mark.parametrize('seed', range(20))
-def test_when_the_grid_grew_does_not_matter(seed: int) -> None:
+def test_map_does_not_depend_on_when_the_grid_grew(seed: int) -> None:
     rng = np.random.default_rng(seed)
-    # a drive away from the origin, so that the grid grows to the left, too; on edges and centres of cells, where a hair
-    # decides which cells the axis crosses
+    # A drive away from the origin, so that the grid grows to the left as well. On edges and centres of cells, small
+    # errors decide which cells the axis crosses.
     count = 300
     readings = dataclasses.replace(
         random_readings(rng, Grid(0.1, -300, -300, 600, 600), count, z_max=3.0),
@@ -236,7 +236,7 @@ def test_when_the_grid_grew_does_not_matter(seed: int) -> None:
     np.testing.assert_array_equal(parts.log_odds(), whole.log_odds())
 
 
-def test_maps_are_added_as_if_their_readings_were() -> None:
+def test_sum_of_maps_is_the_map_of_all_their_readings() -> None:
     rng = np.random.default_rng(5)
     for _ in range(20):
         readings = random_readings(rng, AREA, 30)
@@ -250,7 +250,7 @@ def test_maps_are_added_as_if_their_readings_were() -> None:
 
 
 @pytest.mark.parametrize('count', [1, 2, 16, 17, 500])
-def test_the_grid_is_that_of_the_boxes_of_all_cones(count: int) -> None:
+def test_grid_of_the_map_covers_the_boxes_of_all_cones(count: int) -> None:
     rng = np.random.default_rng(count)
     for _ in range(10):
         readings = random_readings(rng, Grid(0.1, -100, -50, 200, 100), count)
@@ -261,7 +261,7 @@ def test_the_grid_is_that_of_the_boxes_of_all_cones(count: int) -> None:
 
 
 @pytest.mark.parametrize('directions', [1, 2, 4, 5])
-def test_looking_along_a_line_either_way_is_one_direction(directions: int) -> None:
+def test_opposite_yaws_are_the_same_direction(directions: int) -> None:
     yaw = np.random.default_rng(0).uniform(-9.0, 9.0, 300)
     for angle in yaw:
         k = direction_of_yaw(angle, directions)

@@ -1,4 +1,4 @@
-"""The standard map during the drive: that of the readings until then, and at last that of all."""
+"""The standard map at moments of the drive: the map of all readings until then."""
 
 from __future__ import annotations
 
@@ -16,13 +16,13 @@ from forward_grid_mapper.simulation.drive import door_drive
 
 @pytest.fixture(scope='module')
 def maps() -> MapSet:
-    """A drive past a door, its readings in no order."""
+    """Maps of a drive past a door, with readings in random order."""
     readings = door_drive(1, seed=3).readings
     return Mapper(Parameters()).run(readings.select(np.random.default_rng(0).permutation(len(readings))))
 
 
 @pytest.mark.parametrize('count', [1, 2, 7])
-def test_a_moment_is_the_map_of_all_readings_until_then(maps: MapSet, count: int) -> None:
+def test_moment_is_the_map_of_all_readings_until_then(maps: MapSet, count: int) -> None:
     found = list(moments(maps, count))
     assert len(found) == count
     stamps, order = maps.readings.stamp, np.argsort(maps.readings.stamp, kind='stable')
@@ -36,17 +36,17 @@ def test_a_moment_is_the_map_of_all_readings_until_then(maps: MapSet, count: int
     np.testing.assert_array_equal(found[-1].live, maps.live)
 
 
-def test_what_is_known_grows(maps: MapSet) -> None:
+def test_number_of_known_cells_grows(maps: MapSet) -> None:
     known = [int(np.isfinite(moment.live).sum()) for moment in moments(maps, 6)]
     assert known == sorted(known) and known[0] < known[-1]
 
 
-def test_few_readings_have_few_moments(maps: MapSet) -> None:
+def test_number_of_moments_is_at_most_that_of_readings(maps: MapSet) -> None:
     few = Mapper(Parameters()).run(maps.readings.select(slice(3)))
     assert len(list(moments(few, 8))) == 3
 
 
-def test_causes_are_those_of_the_report(maps: MapSet) -> None:
+def test_likeliest_causes_are_those_of_the_forward_model(maps: MapSet) -> None:
     causes = likeliest_causes(maps)
     np.testing.assert_array_equal(causes == RANDOM, maps.unexplained)
     expected = maps.forward_model().expectations(maps.ml)

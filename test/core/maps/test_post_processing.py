@@ -1,4 +1,4 @@
-"""What is made of the map that the search found: readings that passed, walls drawn out, free told from unknown."""
+"""Post-processing of the map found by the search: passes, extended walls, and unknown cells among the free ones."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ def made(readings: Readings, model: ModelParameters, occupied: np.ndarray, **opt
 
 @pytest.mark.parametrize('seed', range(12))
 @pytest.mark.parametrize('filled', [0.0, 0.1, 0.5])
-def test_readings_that_passed_are_those_of_the_twin(seed: int, filled: float) -> None:
+def test_expected_passes_are_those_of_the_twin(seed: int, filled: float) -> None:
     rng = np.random.default_rng(seed)
     readings = off_the_lattice(seed)
     model = plain_model(
@@ -62,20 +62,22 @@ def test_readings_that_passed_are_those_of_the_twin(seed: int, filled: float) ->
     )
     occupied = (rng.random(GRID.size) < filled).astype(np.uint8)
     evidence = made(readings, model, occupied)
-    told = expected_passes(evidence, occupied)
+    actual = expected_passes(evidence, occupied)
     expected = naive.passed(readings, GRID, occupied, model)
     assert np.abs(passes_by_direction(evidence, occupied) * UNIT - expected).max() < 2e-6 * len(readings)
-    assert np.abs(told.all - expected.sum(axis=0)).max() < 8e-6 * len(readings)
-    assert (told.all <= evidence.state.maps.seen + 1e-9).all()
-    assert np.abs(told.noticing - told.all).max() < 1e-9, 'without a limit of the incidence, any surface notices all'
+    assert np.abs(actual.all - expected.sum(axis=0)).max() < 8e-6 * len(readings)
+    assert (actual.all <= evidence.state.maps.seen + 1e-9).all()
+    assert np.abs(actual.noticing - actual.all).max() < 1e-9, (
+        'without a limit of the incidence, any surface notices all'
+    )
     again = Evidence(GRID, model, memory=0.0, start=occupied.reshape(GRID.shape))
     again.extend(readings)
-    assert np.array_equal(expected_passes(again, occupied), told)
+    assert np.array_equal(expected_passes(again, occupied), actual)
 
 
 @pytest.mark.parametrize('seed', range(8))
 @pytest.mark.parametrize('angle', [0.1, 0.3, 0.7, 1.2, 1.5])
-def test_what_any_surface_would_have_noticed_is_that_of_the_twin(seed: int, angle: float) -> None:
+def test_noticing_passes_are_those_of_the_twin(seed: int, angle: float) -> None:
     rng = np.random.default_rng(seed)
     passes = np.where(rng.random((4, 50)) < 0.3, 0.0, rng.gamma(0.7, 3.0, (4, 50)))
     passes[:, :2] *= 1000.0
@@ -91,7 +93,7 @@ def test_what_any_surface_would_have_noticed_is_that_of_the_twin(seed: int, angl
 
 
 @pytest.mark.parametrize('turn', [1j, -1, 1 + 0j])
-def test_directions_of_looking_turn_and_mirror_with_the_lattice(turn: complex) -> None:
+def test_directions_of_view_turn_and_mirror_with_the_lattice(turn: complex) -> None:
     rng = np.random.default_rng(3)
     for u, v in rng.normal(size=(200, 2)):
         bearing = math.atan2(v, u)
@@ -101,7 +103,7 @@ def test_directions_of_looking_turn_and_mirror_with_the_lattice(turn: complex) -
         assert direction_of(-u, v) == (-direction_of(u, v)) % 4
 
 
-def test_readings_of_one_direction_do_not_say_that_a_cell_is_free() -> None:
+def test_cells_passed_in_one_direction_only_are_unknown() -> None:
     beams = {'z': np.full(50, 1.3), 'z_max': 1.3, 'half_angle': 0.02}
     model = plain_model(sigma=0.05, max_incidence_angle=0.7)
     free = np.zeros(GRID.shape, np.uint8)
@@ -110,18 +112,18 @@ def test_readings_of_one_direction_do_not_say_that_a_cell_is_free() -> None:
     x, y, yaw = np.array([(0.05, 0.55, 0.0), (1.05, 0.05, 2.0), (0.65, 0.15, 1.0), (1.35, 0.25, 3.0)]).T
     star = {name: np.repeat(column, 50) for name, column in (('x', x), ('y', y), ('yaw', yaw * math.pi / 4))}
     around = Readings.from_columns(**star, z=np.full(200, 1.3), z_max=1.3, half_angle=0.02)
-    told = post_process(made(along, model, free), 0.0, 0.9, 1.5, NOWHERE)
-    assert (told == -1).all(), 'a wall at a slant would have let all of them pass'
+    actual = post_process(made(along, model, free), 0.0, 0.9, 1.5, NOWHERE)
+    assert (actual == -1).all(), 'a wall at a slant would have let all of them pass'
     assert (post_process(made(along, model, free), 0.0, 0.9, 0.0, NOWHERE) == 0).any()
-    told = post_process(made(around, model, free), 0.0, 0.9, 1.5, NOWHERE)
-    assert told[5, 10] == 0
-    far = np.flatnonzero(told[5] == 0)
+    actual = post_process(made(around, model, free), 0.0, 0.9, 1.5, NOWHERE)
+    assert actual[5, 10] == 0
+    far = np.flatnonzero(actual[5] == 0)
     assert far[0] == 10 - round(FREE_GROWTH / 0.1) - round(FREE_MARGIN / 0.1), (
         'as far as it leads on, and a cell beside'
     )
 
 
-def test_free_space_leads_on_through_what_readings_passed_alone() -> None:
+def test_free_space_grows_only_through_passed_cells() -> None:
     known, passed = np.zeros((3, 12), bool), np.ones((3, 12), bool)
     known[1, 2], passed[:, 7] = True, False
     assert np.array_equal(grown_through(known, passed, 3).any(axis=0), np.arange(12) <= 5)
@@ -129,22 +131,22 @@ def test_free_space_leads_on_through_what_readings_passed_alone() -> None:
     assert np.array_equal(grown_through(known, passed, 0), known)
 
 
-def test_tiles_hold_all_that_decides_about_a_cell() -> None:
+def test_free_growth_and_margin_are_within_the_margin_of_tiles() -> None:
     assert FREE_GROWTH + FREE_MARGIN <= LONGEST_GAP / 2
 
 
-def test_the_map_asked_about_may_be_another_and_weights_count() -> None:
+def test_expected_passes_of_another_map_use_weights() -> None:
     readings, model = off_the_lattice(3), plain_model(sigma=0.06)
     occupied = (np.random.default_rng(0).random(GRID.size) < 0.2).astype(np.uint8)
     evidence = made(readings, model, occupied)
     weight = 1 + np.arange(len(readings)) % 3
     evidence.add_multiplicity(np.repeat(np.arange(len(readings)), weight - 1))
-    told = expected_passes(evidence, occupied)
+    actual = expected_passes(evidence, occupied)
     expected = naive.passed(readings, GRID, occupied, model, weight)
-    assert np.abs(told.all - expected.sum(axis=0)).max() < 8e-6 * weight.sum()
+    assert np.abs(actual.all - expected.sum(axis=0)).max() < 8e-6 * weight.sum()
 
 
-def test_neither_threads_nor_what_is_grazed_change_who_passed(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_passes_do_not_depend_on_threads_or_incidence_limit(monkeypatch: pytest.MonkeyPatch) -> None:
     readings = random_readings(np.random.default_rng(5), GRID, 300)
     occupied = (np.random.default_rng(1).random(GRID.size) < 0.1).astype(np.uint8)
     whole, slanted = plain_model(), plain_model(max_incidence_angle=0.5)
@@ -157,7 +159,7 @@ def test_neither_threads_nor_what_is_grazed_change_who_passed(monkeypatch: pytes
 
 
 @pytest.mark.parametrize('seed', range(30))
-def test_walls_go_on_where_the_twin_has_it(seed: int) -> None:
+def test_walls_are_extended_as_in_the_twin(seed: int) -> None:
     rng = np.random.default_rng(seed)
     occupied = (rng.random(GRID.shape) < 0.05).astype(np.uint8)
     for _ in range(3):
@@ -172,8 +174,10 @@ def test_walls_go_on_where_the_twin_has_it(seed: int) -> None:
     for steps in (1, 3):
         out = np.zeros(GRID.size, np.uint8)
         extend(evidence.state, steps, barred.ravel(), out)
-        told, seen = (a.reshape(GRID.shape) for a in (evidence.state.maps.evidence * QUANTUM, evidence.state.maps.seen))
-        expected = naive.drawn_out(occupied, told, seen, steps, barred)
+        actual, seen = (
+            a.reshape(GRID.shape) for a in (evidence.state.maps.evidence * QUANTUM, evidence.state.maps.seen)
+        )
+        expected = naive.extended_walls(occupied, actual, seen, steps, barred)
         assert np.array_equal(out.reshape(GRID.shape), expected)
 
 
@@ -189,7 +193,7 @@ def seen_by_all(occupied: np.ndarray) -> Evidence:
     return evidence
 
 
-def test_finish_draws_walls_out_by_so_many_cells_and_no_farther_than_something_speaks_against_it() -> None:
+def test_walls_are_extended_up_to_the_limit_or_contrary_evidence() -> None:
     evidence = seen_by_all(wall_at(5, 4, 8))
     assert np.array_equal(post_process(evidence, 0.0, 0.0, 0.0, NOWHERE) == 1, wall_at(5, 4, 8) == 1)
     assert np.array_equal(post_process(evidence, 0.2, 0.0, 0.0, NOWHERE) == 1, wall_at(5, 2, 10) == 1)
@@ -199,7 +203,7 @@ def test_finish_draws_walls_out_by_so_many_cells_and_no_farther_than_something_s
     assert np.array_equal(evidence.observed() == 1, wall_at(5, 4, 8) == 1), 'the search goes on from its own map'
 
 
-def test_no_wall_is_drawn_out_over_where_the_robot_was_or_readings_passed() -> None:
+def test_walls_are_not_extended_over_traversed_or_passed_cells() -> None:
     traversed = NOWHERE.copy()
     traversed[5, 10] = True
     evidence = seen_by_all(wall_at(5, 4, 8))
@@ -209,19 +213,19 @@ def test_no_wall_is_drawn_out_over_where_the_robot_was_or_readings_passed() -> N
     evidence = made(readings, plain_model(sigma=0.05), wall_at(5, 4, 8))
     evidence.state.maps.seen[:], evidence.state.maps.evidence[:] = 1, 1
     assert np.array_equal(post_process(evidence, 0.6, 0.0, 0.0, NOWHERE)[5] == 1, np.arange(14) <= 13)
-    told = post_process(evidence, 0.6, 1.0, 0.0, NOWHERE)
-    assert told[5, 11] == 0
-    assert (told[5, 9:11] == 1).all(), 'up to what is known'
+    actual = post_process(evidence, 0.6, 1.0, 0.0, NOWHERE)
+    assert actual[5, 11] == 0
+    assert (actual[5, 9:11] == 1).all(), 'up to what is known'
 
 
-def test_three_cells_are_no_straight_wall() -> None:
+def test_wall_of_three_cells_is_not_extended() -> None:
     assert np.array_equal(
         post_process(seen_by_all(wall_at(5, 4, 6)), 0.3, 0.0, 0.0, NOWHERE) == 1, wall_at(5, 4, 6) == 1
     )
 
 
 @pytest.mark.parametrize('seed', range(6))
-def test_cells_through_which_nobody_passed_are_unknown(seed: int) -> None:
+def test_cells_with_too_few_passes_are_unknown(seed: int) -> None:
     readings, model = random_readings(np.random.default_rng(seed), GRID, 12), plain_model(sigma=0.06)
     occupied = (np.random.default_rng(seed).random(GRID.size) < 0.05).astype(np.uint8)
     evidence = made(readings, model, occupied)
@@ -231,21 +235,21 @@ def test_cells_through_which_nobody_passed_are_unknown(seed: int) -> None:
     passed = expected_passes(evidence, occupied).all.reshape(GRID.shape)
     assert np.array_equal(post_process(evidence, 0.0, 0.0, 0.0, traversed), plain)
     for least in (0.5, 1.5):
-        told = post_process(evidence, 0.0, least, 0.0, traversed)
+        actual = post_process(evidence, 0.0, least, 0.0, traversed)
         known = ((passed >= least) | traversed) & (plain == 0)
         beside = naive.box_sum(known.astype(int)) > 0
         expected = np.where((plain == 0) & ~beside, -1, plain)
-        assert np.array_equal(told, expected)
+        assert np.array_equal(actual, expected)
     assert (post_process(evidence, 0.0, 100.0, 0.0, NOWHERE) != 0).all()
 
 
-def test_behind_a_wall_nothing_is_free() -> None:
+def test_cells_behind_a_wall_are_unknown() -> None:
     # fifty echoes of a wall 0.6 m ahead, and one that went through a gap
     readings = Readings.from_columns(x=0.05, y=0.55, yaw=0.0, z=np.full(50, 0.6), z_max=1.3, half_angle=0.02)
     evidence = made(readings, dataclasses.replace(plain_model(), sigma=0.05), wall_at(5, 6, 6))
-    told = post_process(evidence, 0.0, 0.9, 0.0, NOWHERE)
-    assert told[5, :7].tolist() == [0] * 6 + [1]
-    assert (told[5, 9:] == -1).all()
+    actual = post_process(evidence, 0.0, 0.9, 0.0, NOWHERE)
+    assert actual[5, :7].tolist() == [0] * 6 + [1]
+    assert (actual[5, 9:] == -1).all()
     assert math.isfinite(evidence.log_likelihood)
 
 
@@ -255,14 +259,14 @@ def test_margins_and_extensions_are_lengths_in_metres(parts: int) -> None:
     wall = np.zeros(grid.shape, np.uint8)
     wall[5 * parts, 4 * parts : 9 * parts] = 1
     evidence = Evidence(grid, plain_model(sigma=0.05), start=wall)
-    # a thin beam along the middle of a row, so often that it is known to be free
+    # a thin beam along the middle of a row, repeated so often that the cells are known to be free
     readings = Readings.from_columns(
         x=0.01, y=0.75 + 0.05 / parts, yaw=0.0, z=np.full(20, 1.35), z_max=2.0, half_angle=0.002
     )
     evidence.extend(readings)
     evidence.state.maps.seen[:], evidence.state.maps.evidence[:] = 1, 1
-    told = post_process(evidence, 0.3, 1.0, 0.0, np.zeros(grid.shape, bool))
-    columns = np.flatnonzero(told[5 * parts] == 1)
+    actual = post_process(evidence, 0.3, 1.0, 0.0, np.zeros(grid.shape, bool))
+    columns = np.flatnonzero(actual[5 * parts] == 1)
     assert (columns[0], columns[-1]) == (1 * parts, 12 * parts - 1)
-    free = np.flatnonzero(told[:, 7 * parts] == 0)
+    free = np.flatnonzero(actual[:, 7 * parts] == 0)
     assert len(free) * grid.resolution == pytest.approx(2 * FREE_MARGIN + grid.resolution)

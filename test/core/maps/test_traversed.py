@@ -1,4 +1,4 @@
-"""Cells that the robot drove over: points, and what lies between those that belong together."""
+"""Cells that the robot drove over: at each pose and between consecutive poses."""
 
 from __future__ import annotations
 
@@ -35,18 +35,18 @@ def cells(*places: tuple[float, float]) -> set[tuple[int, int]]:
     return {(r, c) for r, c in out if 0 <= r < GRID.height and 0 <= c < GRID.width}
 
 
-def told(*arguments: list[float]) -> set[tuple[int, int]]:
+def traversed_by(*arguments: list[float]) -> set[tuple[int, int]]:
     return {(int(r), int(c)) for r, c in np.argwhere(traversed_cells(readings_at(*arguments), GRID))}
 
 
 @settings(max_examples=60, deadline=None)
 @given(st.integers(0, 2**32 - 1), st.integers(1, 12))
-def test_the_cells_are_those_of_the_points_and_of_the_way_between(seed: int, count: int) -> None:
+def test_traversed_cells_are_those_of_points_and_lines_between(seed: int, count: int) -> None:
     rng = np.random.default_rng(seed)
     x, y = np.cumsum(rng.uniform(-0.5, 0.5, (2, count)), axis=1) + np.array([[0.5], [2.0]])
     stamp = np.cumsum(rng.choice([0, 100, 400, 600], count)) * MS
     shuffle = rng.permutation(count) if len(set(stamp)) == count else np.arange(count)
-    found = told(x[shuffle], y[shuffle], stamp[shuffle])
+    found = traversed_by(x[shuffle], y[shuffle], stamp[shuffle])
     expected = cells(*zip(x, y, strict=True))
     assert expected <= found
     near = set(expected)
@@ -55,7 +55,7 @@ def test_the_cells_are_those_of_the_points_and_of_the_way_between(seed: int, cou
         if stamp[j] - stamp[i] <= LONGEST_PAUSE and step <= LONGEST_STEP:
             way = [(x[i] + f * (x[j] - x[i]), y[i] + f * (y[j] - y[i])) for f in np.linspace(0, 1, 400)]
             near |= cells(*way)
-            # no more than a quarter of a cell lies between the points that are set
+            # points on the line are at most a quarter of a cell apart
             coarse = int(step / 0.1 * 4.0) + 2
             expected |= cells(
                 *((x[i] + f * (x[j] - x[i]), y[i] + f * (y[j] - y[i])) for f in np.arange(coarse) / (coarse - 1))
@@ -65,12 +65,12 @@ def test_the_cells_are_those_of_the_points_and_of_the_way_between(seed: int, cou
 
 
 @pytest.mark.parametrize('count', [8, 12, 16, 24])
-def test_the_middle_of_a_ring_of_sonars_is_driven_over_before_it_moves(count: int) -> None:
+def test_middle_of_a_ring_of_sonars_is_traversed_at_standstill(count: int) -> None:
     yaw = np.arange(2 * count) * 2 * math.pi / count
     x, y = 0.52 + 0.25 * np.cos(yaw), 1.97 + 0.25 * np.sin(yaw)
-    found = told(x, y, np.arange(2 * count) * 10 * MS)
+    found = traversed_by(x, y, np.arange(2 * count) * 10 * MS)
     inside = cells(*((0.52 + u, 1.97 + v) for u in (-0.1, 0.0, 0.1) for v in (-0.1, 0.0, 0.1)))
-    # what is free reaches a cell beyond what was traversed over
+    # free space reaches a cell beyond the traversed cells
     beside = {(row + v, column + u) for row, column in found for u in (-1, 0, 1) for v in (-1, 0, 1)}
     assert inside <= beside
 
@@ -78,13 +78,13 @@ def test_the_middle_of_a_ring_of_sonars_is_driven_over_before_it_moves(count: in
 @pytest.mark.parametrize(
     ('pause', 'step', 'joined'), [(400, 0.7, True), (500, 0.7, True), (501, 0.7, False), (400, 0.81, False)]
 )
-def test_gaps_and_jumps_are_not_joined(pause: int, step: float, joined: bool) -> None:
-    found = told([0.05, 0.05 + step], [1.05, 1.05], [0, pause * MS])
+def test_poses_with_a_long_pause_or_step_are_not_joined(pause: int, step: float, joined: bool) -> None:
+    found = traversed_by([0.05, 0.05 + step], [1.05, 1.05], [0, pause * MS])
     assert len(found) == (round(step / 0.1) + 1 if joined else 2)
 
 
 def ring(radius: float, count: int, sweeps: int, drive: float = 0.0, jump: float = 0.0) -> Readings:
-    """Sweeps of a ring of sonars on a robot that drives so far from one to the next, and jumps before the last."""
+    """Sweeps of a ring of sonars on a robot that drives `drive` metres a sweep and jumps before the last one."""
     k = np.arange(count * sweeps)
     yaw = k % count * 2 * math.pi / count
     x = 1.0 + drive * (k / count) + np.where(k // count == sweeps - 1, jump, 0.0)
@@ -103,7 +103,7 @@ def ring(radius: float, count: int, sweeps: int, drive: float = 0.0, jump: float
 
 @pytest.mark.parametrize('radius', [0.25, 0.75, 1.2])
 @pytest.mark.parametrize('drive', [0.0, 0.2])
-def test_the_middle_of_a_large_robot_is_traversed_too(radius: float, drive: float) -> None:
+def test_middle_of_a_large_robot_is_traversed(radius: float, drive: float) -> None:
     readings = ring(radius, 16, 5, drive)
     found = {(int(r), int(c)) for r, c in np.argwhere(traversed_cells(readings, GRID))}
     beside = {(row + v, column + u) for row, column in found for u in (-1, 0, 1) for v in (-1, 0, 1)}
@@ -115,7 +115,7 @@ def test_the_middle_of_a_large_robot_is_traversed_too(radius: float, drive: floa
 
 @pytest.mark.parametrize('radius', [0.25, 0.75])
 @pytest.mark.parametrize('jump', [1.9, 2.4])
-def test_a_robot_that_jumps_draws_no_lines_however_large_it_is(radius: float, jump: float) -> None:
+def test_jump_is_not_joined_at_any_size_of_the_robot(radius: float, jump: float) -> None:
     wide = Grid(0.1, -10, -10, 80, 60)
     still, jumped = ring(radius, 16, 6), ring(radius, 16, 6, jump=jump)
     assert longest_step(jumped) == pytest.approx(longest_step(still))
@@ -123,13 +123,13 @@ def test_a_robot_that_jumps_draws_no_lines_however_large_it_is(radius: float, ju
     either = traversed_cells(still, wide) | traversed_cells(ahead, wide)
     found = traversed_cells(jumped, wide)
     _, columns = np.nonzero(found & ~either)
-    # what lies between the two places, but for pairs of sensors that the jump brought nearer together
+    # cells between the two places, except for pairs of sensors that the jump brought closer together
     x, _ = wide.centers()
     between = (x[columns] > 1.0 + radius + 0.1) & (x[columns] < 1.0 + jump - radius - 0.1)
     assert not between.any() or jump - 2 * radius < longest_step(still)
 
 
-def test_a_single_pair_of_sensors_tells_nothing_of_the_size() -> None:
+def test_longest_step_with_two_sensors() -> None:
     two = readings_at([0.0, 3.0] * 2, [2.0] * 4, [0, 1, 2, 3])
     two = dataclasses.replace(two, sensor=np.array([0, 1, 0, 1], np.int32), sensor_names=('a', 'b'))
     assert longest_step(two) == pytest.approx(3.0 + MEANWHILE)
@@ -139,14 +139,14 @@ def test_a_single_pair_of_sensors_tells_nothing_of_the_size() -> None:
     assert longest_step(two.select(slice(0, 0))) == LONGEST_STEP
 
 
-def test_readings_are_taken_in_the_order_of_their_stamps() -> None:
-    # there and back again: out of order the ends would be joined
+def test_traversed_cells_follow_the_order_of_stamps() -> None:
+    # there and back: in the given order, the ends would be joined
     x, y, stamp = [0.05, 1.65, 0.85], [1.05, 1.05, 1.05], [0, 600 * MS, 300 * MS]
-    assert told(x, y, stamp) == cells(*((0.05 + 0.1 * k, 1.05) for k in range(17)))
+    assert traversed_by(x, y, stamp) == cells(*((0.05 + 0.1 * k, 1.05) for k in range(17)))
 
 
-def test_what_is_off_the_grid_is_left_out_and_what_was_set_stays() -> None:
-    assert told([-1e6, 1e6, 0.05], [0.0, 0.0, 1.05], [0, 1, 2]) == cells((0.05, 1.05))
+def test_poses_off_the_grid_are_ignored_and_set_cells_stay_set() -> None:
+    assert traversed_by([-1e6, 1e6, 0.05], [0.0, 0.0, 1.05], [0, 1, 2]) == cells((0.05, 1.05))
     traversed = np.zeros(GRID.shape, bool)
     traversed[3, 4] = True
     mark_traversed(np.zeros(0), np.zeros(0), np.zeros(0, np.int64), GRID, traversed)

@@ -1,4 +1,4 @@
-"""Messages of a file in batches give what they give one by one, bit for bit, whatever is wrong with them."""
+"""Messages of a file in batches give bit-identical results to single messages, also with bad messages."""
 
 from __future__ import annotations
 
@@ -41,14 +41,14 @@ def mount_of(base: str, frame: str, stamp: int) -> Pose2 | str | None:
     return MOUNTS.get(frame)
 
 
-def drive(seed: int, count: int, trouble: float) -> list[Message]:
-    """A drive in the order of recording, with more gaps, jumps and late stamps the more trouble there is."""
+def drive(seed: int, count: int, bad_share: float) -> list[Message]:
+    """A drive in the order of recording; the larger `bad_share`, the more gaps, jumps and late stamps."""
     rng = random.Random(seed)
     found: list[Message] = []
     now, x, y = 10 * NANOSECONDS, 0.0, 0.0
 
     def bad(times: float = 1.0) -> bool:
-        return rng.random() < trouble * times
+        return rng.random() < bad_share * times
 
     for _ in range(count):
         now += rng.randrange(10_000_000, 80_000_000)
@@ -104,8 +104,8 @@ def equal(one: Readings, other: Readings) -> bool:
     return same and one.sensor_names == other.sensor_names
 
 
-def told(made: PoseAssociator) -> dict[str, Any]:
-    """All that an associator says, orders included."""
+def state_of(made: PoseAssociator) -> dict[str, Any]:
+    """The whole state of an associator, including the order of entries."""
     return {
         'received': made.received,
         'rejected': list(made.rejected.items()),
@@ -124,30 +124,30 @@ def told(made: PoseAssociator) -> dict[str, Any]:
 @settings(max_examples=80, deadline=None)
 @given(
     seed=st.integers(0, 2**32),
-    trouble=st.sampled_from([0.0, 0.002, 0.02, 0.2]),
+    bad_share=st.sampled_from([0.0, 0.002, 0.02, 0.2]),
     bound=st.sampled_from([0, 0, 50]),
     cells=st.sampled_from([50_000_000, 20_000, 10_000]),
     over=st.sampled_from(['no_echo', 'discard']),
     invalid=st.sampled_from(['discard', 'no_echo']),
 )
-def test_batches_give_what_single_messages_give(
-    seed: int, trouble: float, bound: int, cells: int, over: str, invalid: str
+def test_batches_give_the_result_of_single_messages(
+    seed: int, bad_share: float, bound: int, cells: int, over: str, invalid: str
 ) -> None:
     chosen = {'max_readings': bound, 'max_cells': cells, 'over_range': over, 'invalid_range': invalid}
     parameters = Parameters.from_flat(chosen)
-    messages = drive(seed, 600, trouble)
+    messages = drive(seed, 600, bad_share)
     whole, parts = one_by_one(messages, parameters), in_batches(messages, parameters, seed)
-    assert told(whole) == told(parts)
+    assert state_of(whole) == state_of(parts)
     assert equal(whole.buffer.snapshot(), parts.buffer.snapshot())
     whole.finish()
     parts.finish()
-    assert told(whole) == told(parts)
+    assert state_of(whole) == state_of(parts)
     assert equal(whole.readings, parts.readings)
     for one, other in zip(whole.odometry, parts.odometry, strict=True):
         np.testing.assert_array_equal(one, other)
 
 
-def test_a_drive_without_trouble_is_taken_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_batch_without_bad_messages_is_not_split(monkeypatch: pytest.MonkeyPatch) -> None:
     def never(self: PoseAssociator, message: object, sent: int = 0) -> None:
         raise AssertionError('one message at a time')
 
@@ -158,7 +158,7 @@ def test_a_drive_without_trouble_is_taken_at_once(monkeypatch: pytest.MonkeyPatc
 
 
 @pytest.mark.parametrize('at', [99, 100, 101])
-def test_a_stamp_ahead_at_the_end_of_a_batch_is_dropped_by_the_next(at: int) -> None:
+def test_stamp_ahead_at_the_end_of_a_batch_is_dropped_by_the_next_batch(at: int) -> None:
     messages: list[Message] = []
     for k in range(200):
         stamp = (100 + k) * NANOSECONDS // 10
@@ -173,21 +173,21 @@ def test_a_stamp_ahead_at_the_end_of_a_batch_is_dropped_by_the_next(at: int) -> 
         made.finish()
         assert made.odometry_rejected == {'ahead_of_others': 1}
         assert made.time_jumps == 0 and made.rejected['zero_stamp'] == 4
-    assert told(whole) == told(parts)
+    assert state_of(whole) == state_of(parts)
     assert equal(whole.readings, parts.readings)
 
 
-def test_readings_that_wait_for_given_poses() -> None:
+def test_readings_before_all_odometry_give_the_result_of_single_messages() -> None:
     messages = drive(5, 300, 0.01)
     later = sorted(messages, key=lambda m: isinstance(m, OdometryMessage))
     whole, parts = one_by_one(later, Parameters()), in_batches(later, Parameters(), 5)
-    assert told(whole) == told(parts)
+    assert state_of(whole) == state_of(parts)
     assert equal(whole.readings, parts.readings)
 
 
 @settings(max_examples=60, deadline=None)
 @given(seed=st.integers(0, 2**32), angle=st.sampled_from([0.0, 0.5]), limit=st.sampled_from([0.0, 3.0]))
-def test_many_measurements_are_those_of_each(seed: int, angle: float, limit: float) -> None:
+def test_measurements_of_a_batch_equal_single_ones(seed: int, angle: float, limit: float) -> None:
     parameters = Parameters.from_flat({'field_of_view': angle, 'max_range': limit}).association
     ranges = [m for m in drive(seed, 200, 0.5) if isinstance(m, RangeMessage)]
     many = measure_all(batch_of(list(enumerate(ranges))).ranges, parameters)
@@ -206,7 +206,7 @@ def test_many_measurements_are_those_of_each(seed: int, angle: float, limit: flo
 
 
 @pytest.mark.parametrize('sizes', [[10, 5000, 1, 1, 1023, 7000], [1024, 1024, 1, 9000], [20000]])
-def test_limits_are_looked_at_as_one_by_one(sizes: list[int]) -> None:
+def test_limits_of_a_batch_are_checked_as_for_single_messages(sizes: list[int]) -> None:
     one, many = LimitWatch(), LimitWatch()
     rng = random.Random(3)
     for size in sizes:
@@ -219,7 +219,7 @@ def test_limits_are_looked_at_as_one_by_one(sizes: list[int]) -> None:
     np.testing.assert_array_equal(one._samples[: one._held], many._samples[: many._held])
 
 
-def test_a_batch_yields_its_messages_in_their_order() -> None:
+def test_batch_yields_its_messages_in_order() -> None:
     messages = drive(7, 200, 0.0)
     batch = batch_of(random.Random(1).sample(list(enumerate(messages)), len(messages)))
     assert list(batch.one_by_one()) == messages

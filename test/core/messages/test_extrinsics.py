@@ -1,4 +1,4 @@
-"""Inclined sensors: what they say of the plane, against rays and cones in space."""
+"""Inclined sensors: their readings projected into the plane, compared with rays and cones in space."""
 
 from __future__ import annotations
 
@@ -33,8 +33,8 @@ def axis_of(yaw: float, elevation: float) -> np.ndarray:
 
 @pytest.mark.parametrize('half_angle', [0.01, 0.13, 0.26, 0.5])
 @pytest.mark.parametrize('degrees', [0.0, 5.0, 30.0, -30.0, 59.0])
-def test_the_shadow_is_as_wide_as_the_cone_seen_from_above(half_angle: float, degrees: float) -> None:
-    """Rays all around the rim of the cone: the largest angle between one of them and the axis, seen from above."""
+def test_projected_cone_is_as_wide_as_the_cone_seen_from_above(half_angle: float, degrees: float) -> None:
+    """Rays around the rim of the cone: the largest angle between a ray and the axis, seen from above."""
     elevation = math.radians(degrees)
     axis = axis_of(0.0, elevation)
     side, up = np.array([0.0, 1.0, 0.0]), axis_of(0.0, elevation + math.pi / 2)
@@ -45,9 +45,9 @@ def test_the_shadow_is_as_wide_as_the_cone_seen_from_above(half_angle: float, de
 
 
 @pytest.mark.parametrize(('half_angle', 'degrees'), [(0.6, 60.0), (math.radians(31), -59.5), (1.5, 10.0)])
-def test_a_cone_that_holds_the_vertical_has_no_shadow(half_angle: float, degrees: float) -> None:
+def test_cone_that_contains_the_vertical_is_rejected_as_steep(half_angle: float, degrees: float) -> None:
     elevation = math.radians(degrees)
-    # the zenith, or the nadir, lies within the cone
+    # the zenith or the nadir is within the cone
     assert math.acos(abs(axis_of(0.0, elevation)[2])) <= half_angle
     assert shadow_of(half_angle, elevation) is None
     m = measured(half_angle=half_angle)
@@ -57,8 +57,8 @@ def test_a_cone_that_holds_the_vertical_has_no_shadow(half_angle: float, degrees
     assert STEEP in REASONS
 
 
-def test_an_upright_wall_is_where_it_is() -> None:
-    """Rays against walls in space: the range along an inclined axis, and where it ends in the plane."""
+def test_echo_of_a_vertical_wall_is_projected_onto_the_wall() -> None:
+    """Rays and walls in space: the range along an inclined axis, and its end in the plane."""
     rng = np.random.default_rng(1)
     for _ in range(200):
         yaw, elevation = rng.uniform(-math.pi, math.pi), rng.uniform(-1.0, 1.0)
@@ -72,19 +72,19 @@ def test_an_upright_wall_is_where_it_is() -> None:
         x, y = m.z * math.cos(mount.yaw), m.z * math.sin(mount.yaw)
         assert x * normal[0] + y * normal[1] == pytest.approx(away)
         assert m.z_max == pytest.approx(2 * m.z)
-        # a range that is too long by σ ends in the plane farther by the new σ
+        # a range that is too long by σ ends farther in the plane, by the new σ
         longer = measured(along + 0.1, 2 * along, 0.05, 0.01)
         project(longer, mount.elevation)
         assert m.sigma == pytest.approx(longer.z - m.z)
 
 
-def test_thirty_degrees_make_a_sixth_of_the_range() -> None:
+def test_range_at_30_degrees_of_elevation_is_scaled_by_the_cosine() -> None:
     m = measured(2.0 / math.cos(math.radians(30.0)))
     project(m, math.radians(30.0))
     assert m.z == pytest.approx(2.0)
 
 
-def test_along_the_plane_nothing_changes_not_even_the_last_digit() -> None:
+def test_measurement_of_a_level_sensor_is_unchanged() -> None:
     for elevation in (0.0, -0.0, 1e-9):
         m = measured(1.2345)
         before = values(m)
@@ -93,7 +93,7 @@ def test_along_the_plane_nothing_changes_not_even_the_last_digit() -> None:
 
 
 @pytest.mark.parametrize('elevation', [0.1, -0.7, 1.0])
-def test_no_echo_stays_no_echo_and_no_variance_stays_none(elevation: float) -> None:
+def test_projection_keeps_no_echo_and_no_variance(elevation: float) -> None:
     m = measured(math.inf, variance=0.0)
     assert project(m, elevation) == ''
     assert m.z == m.z_max < 4.0
@@ -101,12 +101,12 @@ def test_no_echo_stays_no_echo_and_no_variance_stays_none(elevation: float) -> N
 
 
 @pytest.mark.parametrize('degrees', [60.1, -60.1, 89.0, 90.0, -90.0])
-def test_steep_sensors_have_no_place_in_the_plane(degrees: float) -> None:
+def test_steep_sensors_are_rejected(degrees: float) -> None:
     assert mount_of(0.0, 0.0, axis_of(0.3, math.radians(degrees)).tolist()) == STEEP
     assert project(measured(half_angle=0.01), math.radians(degrees)) == STEEP
 
 
-def test_a_mount_is_its_pose_in_the_plane() -> None:
+def test_mount_compares_and_composes_as_its_pose_in_the_plane() -> None:
     mount = Mount(1.0, 2.0, 0.5, -0.3)
     assert mount == Pose2(1.0, 2.0, 0.5) == (1.0, 2.0, 0.5)
     assert Pose2(1.0, 0.0, 0.0).compose(mount) == (2.0, 2.0, 0.5)
@@ -114,7 +114,7 @@ def test_a_mount_is_its_pose_in_the_plane() -> None:
     assert Mount(1.0, 2.0, 0.5).elevation == 0.0
 
 
-def test_readings_are_of_the_plane_and_steep_ones_are_rejected_by_reason() -> None:
+def test_readings_are_projected_and_steep_ones_rejected_with_reason() -> None:
     mounts = {
         'level': Pose2(0.0, 0.0, 0.0),
         'down': Mount(0.0, 0.0, 0.0, -math.radians(30.0)),

@@ -1,4 +1,4 @@
-"""Whether a map may grow to hold one more reading."""
+"""`MapExtent`: which readings the map may grow for."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ def measured(z: float = 1.0, z_max: float = 4.0, angle: float = 0.3) -> Measurem
     return made
 
 
-def test_it_grows_up_to_its_bounds() -> None:
+def test_map_grows_up_to_its_limits() -> None:
     extent = MapExtent()
     assert extent.admit(Pose2(0, 0, 0), measured(), PARAMETERS) == ''
     assert extent.admit(Pose2(5, 5, 0), measured(), PARAMETERS) == ''
@@ -38,16 +38,16 @@ def test_it_grows_up_to_its_bounds() -> None:
 @pytest.mark.parametrize(
     'pose', [Pose2(math.nan, 0, 0), Pose2(0, math.inf, 0), Pose2(0, 0, math.nan), Pose2(3e7, 0, 0)]
 )
-def test_an_impossible_pose_is_refused(pose: tuple[float, float, float]) -> None:
+def test_impossible_pose_is_rejected(pose: tuple[float, float, float]) -> None:
     assert MapExtent().admit(Pose2(*pose), measured(), PARAMETERS) == 'too_far_away'
 
 
-def test_a_cone_of_millions_of_cells_is_refused() -> None:
+def test_cone_of_millions_of_cells_is_rejected() -> None:
     wide = Parameters.from_flat({'max_cells': 10**9})
     assert MapExtent().admit(Pose2(0, 0, 0), measured(150.0, 200.0, 3.0), wide) == 'large_cone'
 
 
-def test_restored_readings_count() -> None:
+def test_restored_readings_extend_the_map() -> None:
     extent = MapExtent()
     readings = Readings.from_columns(x=[0.0, 25.0], y=0.0, yaw=0.0, z=[1.0, 1.0], z_max=4.0, half_angle=0.15)
     assert not any(mask.any() for mask in extent.restore(readings, PARAMETERS).values())
@@ -55,8 +55,8 @@ def test_restored_readings_count() -> None:
     assert extent.admit(Pose2(90, 0, 0), measured(), PARAMETERS) == 'far_from_map'
 
 
-def test_restored_readings_that_the_map_cannot_hold_are_refused_alone() -> None:
-    """As where the resolution was changed, or somebody made the journal up."""
+def test_only_restored_readings_outside_the_limits_are_rejected() -> None:
+    """As if the resolution was changed, or the journal was forged."""
     x, z = np.zeros(50), np.ones(50)
     x[[3, 4]] = 1.9e7, -1.9e7
     z[[7, 8]] = 1e300, 5000.0
@@ -67,7 +67,7 @@ def test_restored_readings_that_the_map_cannot_hold_are_refused_alone() -> None:
     assert refused == {'large_cone': [7, 8], 'too_far_away': [3, 4]}
 
 
-def test_restored_readings_are_those_that_were_admitted() -> None:
+def test_restoring_readings_equals_admitting_them() -> None:
     rng = np.random.default_rng(1)
     few = Parameters.from_flat({'max_cells': 10_000, 'max_jump': 1e7})
     columns = {'x': rng.normal(scale=6, size=300), 'y': rng.normal(scale=6, size=300), 'z': rng.uniform(0.5, 4, 300)}
@@ -83,13 +83,13 @@ def test_restored_readings_are_those_that_were_admitted() -> None:
     assert all_at_once._box == pytest.approx(one._box)
 
 
-def test_reach_is_that_of_the_echo_and_not_of_the_sensor() -> None:
+def test_reach_depends_on_the_echo_and_not_on_the_largest_range() -> None:
     assert reach_with_margin(measured(1.0, 3e38), PARAMETERS) < 2.0
     assert reach_with_margin(measured(4.0, 4.0), PARAMETERS) == pytest.approx(4.0 + 0.1 + 0.2)
 
 
-def test_how_far_a_reading_reaches() -> None:
-    """Up to four standard deviations beyond its range, or the arc that an echo marks, and two cells; σ is stated."""
+def test_reach_of_a_reading_with_margins() -> None:
+    """Up to four standard deviations beyond the range, or to the end of the arc of the echo, and two cells more."""
     cell = PARAMETERS.grid.resolution
     sigma = PARAMETERS.model.sigma
     assert reach_with_margin(measured(1.0, 9.0), PARAMETERS) == pytest.approx(1.0 + CUT * sigma + 2 * cell)
@@ -97,7 +97,7 @@ def test_how_far_a_reading_reaches() -> None:
     stated = measure(RangeMessage(0, 'sonar', 1.0, 0.1, 9.0, 0.3, 0.25), PARAMETERS.association)
     assert isinstance(stated, Measurement)
     assert reach_with_margin(stated, PARAMETERS) == pytest.approx(1.0 + CUT * 0.5 + 2 * cell)
-    # no finer than half a cell
+    # not less than half a cell
     coarse = Parameters.from_flat({'resolution': 1.0})
     assert reach_with_margin(measured(1.0, 90.0), coarse) == pytest.approx(1.0 + CUT * 0.5 + 2.0)
 
@@ -107,8 +107,8 @@ def largest(count: int, **values: float) -> Parameters:
 
 
 @pytest.mark.parametrize('across', [True, False])
-def test_as_many_cells_as_are_admitted_and_no_more(across: bool) -> None:
-    """Two readings 90 m apart: as many cells in a row as the box has, and one more since it may begin in a cell."""
+def test_map_of_exactly_max_cells_is_accepted_and_one_more_is_not(across: bool) -> None:
+    """Two readings 90 m apart: their box may have one more cell in a row, since it may begin within a cell."""
     reach = reach_with_margin(measured(), PARAMETERS)
     cell = PARAMETERS.grid.resolution
     pose = Pose2(90.0, 0, 0) if across else Pose2(0, 90.0, 0)
@@ -126,8 +126,8 @@ def test_as_many_cells_as_are_admitted_and_no_more(across: bool) -> None:
 
 @pytest.mark.parametrize('restored', [True, False])
 @pytest.mark.parametrize(('x', 'y'), [(1, 0), (-1, 0), (0, 1), (0, -1)])
-def test_how_far_a_reading_may_be_from_the_map(x: int, y: int, restored: bool) -> None:
-    """From the edge of the map, not from its middle, on each side."""
+def test_reading_farther_than_max_jump_from_the_map_is_rejected(x: int, y: int, restored: bool) -> None:
+    """Measured from the edge of the map, not from its middle, on each side."""
     parameters = Parameters.from_flat({'max_jump': 20.0})
     reach = reach_with_margin(measured(), parameters)
     for distance, expected in ((reach + 19.9, ''), (reach + 20.1, 'far_from_map')):
@@ -140,7 +140,7 @@ def test_how_far_a_reading_may_be_from_the_map(x: int, y: int, restored: bool) -
         assert extent.admit(Pose2(50.0 + x * distance, 70.0 + y * distance, 0), measured(), parameters) == expected
 
 
-def test_cones_of_as_many_cells_as_one_reading_may_touch() -> None:
+def test_cone_at_the_limit_of_cells_is_accepted_and_above_is_not() -> None:
     wide = largest(10**9)
     for z, expected in ((138.0, ''), (142.0, 'large_cone')):
         # 2e6 = 1.0 rad · (141.4 m / 0.1 m)²
@@ -151,8 +151,8 @@ def test_cones_of_as_many_cells_as_one_reading_may_touch() -> None:
     assert FARTHEST == 2e7 and LARGEST_CONE == 2_000_000
 
 
-def test_the_sigma_of_restored_readings_is_theirs_or_the_model_s() -> None:
-    """With 1 m the map of two readings 9 m apart is too large, with that of the model it is not."""
+def test_restored_readings_have_their_own_sigma_or_that_of_the_model() -> None:
+    """With a σ of 1 m, the map of two readings 9 m apart is too large; with that of the model it is not."""
     few = largest(10_000)
     for sigma, refused in ((0.0, False), (0.1, False), (1.0, True)):
         restored = Readings.from_columns(

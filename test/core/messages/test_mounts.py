@@ -1,4 +1,4 @@
-"""Poses of sensors on the robot: numbers that can only be of other units are refused."""
+"""Poses of sensors on the robot; numbers in wrong units are rejected."""
 
 from __future__ import annotations
 
@@ -14,16 +14,16 @@ from forward_grid_mapper.core.messages.mounts import FARTHEST, TURN, far_mounts,
 
 
 @pytest.mark.parametrize('form', [list, tuple, np.array, lambda values: array.array('d', values)])
-def test_forms_of_three_numbers(form: type) -> None:
+def test_pose_from_any_sequence_of_three_numbers(form: type) -> None:
     assert mount_from('left', form([0.1, -0.2, 1.5])) == Pose2(0.1, -0.2, 1.5)
 
 
 @pytest.mark.parametrize('kind', [np.float32, np.int32])
-def test_numbers_of_numpy_are_numbers(kind: type) -> None:
+def test_pose_from_numpy_numbers(kind: type) -> None:
     assert mount_from('left', np.array([1, 0, -2], kind)) == Pose2(1.0, 0.0, -2.0)
 
 
-def test_the_limits_are_admitted() -> None:
+def test_values_at_the_limits_are_accepted() -> None:
     assert mount_from('left', [FARTHEST, 0, float(np.float32(-TURN))]).x == FARTHEST
 
 
@@ -40,12 +40,12 @@ def test_the_limits_are_admitted() -> None:
         (None, 'three finite numbers'),
     ],
 )
-def test_what_is_refused(values: object, message: str) -> None:
+def test_bad_pose_is_rejected_with_reason(values: object, message: str) -> None:
     with pytest.raises(ParameterError, match=message):
         mount_from('left', values)
 
 
-def test_far_sensors_are_named_with_the_farthest() -> None:
+def test_warning_names_far_sensors_and_the_largest_distance() -> None:
     near = Pose2(FARTHEST, 0.0, 0.0)
     assert far_mounts({}) == far_mounts({'left': near}) == []
     (warning,) = far_mounts({'left': near, 'back': Pose2(-150.0, 0.0, 0.0), 'front': Pose2(0.0, 170.0, 0.0)})

@@ -1,4 +1,4 @@
-"""The record of a drive's odometry: in order, bounded, and never changed under who looks at it."""
+"""The record of a drive's odometry: sorted, bounded, and with snapshots that never change."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from forward_grid_mapper.core.messages.odometry_record import OVERLAP, PART, Odo
 from forward_grid_mapper.core.messages.pose_association import PoseAssociator
 
 
-def test_any_order_gives_what_a_dictionary_holds() -> None:
+def test_poses_in_any_order_are_sorted_by_stamp() -> None:
     rng = random.Random(1)
     for _ in range(50):
         record, known = OdometryRecord(0), {}
@@ -40,7 +40,7 @@ def test_any_order_gives_what_a_dictionary_holds() -> None:
             assert np.array_equal(now_pose, then_pose)
 
 
-def test_memory_is_bounded_and_the_way_stays() -> None:
+def test_memory_is_bounded_and_the_path_stays_accurate() -> None:
     record, most = OdometryRecord(2000), 2000
     turns = np.cumsum(np.random.default_rng(0).normal(0.0, 0.004, 50_000))
     true = np.cumsum(np.stack([0.01 * np.cos(turns), 0.01 * np.sin(turns)], 1), 0)
@@ -52,11 +52,11 @@ def test_memory_is_bounded_and_the_way_stays() -> None:
     assert (np.diff(stamp) > 0).all()
     again = np.stack([np.interp(np.arange(50_000) * NANOSECONDS // 50, stamp, pose[:, axis]) for axis in (0, 1)], 1)
     assert np.hypot(*(again - true).T).max() < 0.05, 'half a cell, over 500 m'
-    # columns of the size before the bound are not kept along
+    # arrays of the size before thinning are not kept
     assert record._stamp.nbytes + record._pose.nbytes <= 2 * 32 * (most + 1024)
 
 
-def test_what_is_kept_for_the_next_reading_does_not_count() -> None:
+def test_overlap_before_a_new_drive_is_not_counted() -> None:
     record = OdometryRecord()
     assert record.since_anew == 0
     for k in range(100):
@@ -73,19 +73,19 @@ def test_what_is_kept_for_the_next_reading_does_not_count() -> None:
     assert record.since_anew == 0
 
 
-def test_a_robot_that_stands_costs_the_way_nothing() -> None:
+def test_standstill_removes_no_poses_of_the_path() -> None:
     record = OdometryRecord(1000)
     for k in range(400):
         record.add(k, Pose2(0.01 * k, 0.0, 3.1 if k % 2 else -3.1))
-    way = record.snapshot()[1][50:350]
+    path = record.snapshot()[1][50:350]
     for k in range(400, 20_000):
         record.add(k, Pose2(4.0, 0.0, 3.1))
     kept = {tuple(pose) for pose in record.snapshot()[1].tolist()}
-    assert {tuple(pose) for pose in way.tolist()} <= kept
+    assert {tuple(pose) for pose in path.tolist()} <= kept
     assert len(record) <= 1000
 
 
-def test_when_some_go_enough_go() -> None:
+def test_thinning_removes_at_least_a_quarter() -> None:
     record = OdometryRecord(100)
     rng = random.Random(3)
     for k in range(101):
@@ -94,7 +94,7 @@ def test_when_some_go_enough_go() -> None:
     assert record.snapshot()[0][[0, -1]].tolist() == [0, 100]
 
 
-def test_each_part_of_the_drive_gives_up_some() -> None:
+def test_thinning_is_spread_evenly_over_the_drive() -> None:
     most = 4 * PART
     record, rng = OdometryRecord(most), random.Random(4)
     for k in range(most + 3 * PART):
@@ -107,7 +107,7 @@ def test_each_part_of_the_drive_gives_up_some() -> None:
     assert parts.max() < 0.8 * PART
 
 
-def test_a_drive_that_begins_anew_begins_before_its_first_reading() -> None:
+def test_new_drive_begins_shortly_before_its_first_reading() -> None:
     record = OdometryRecord(0)
     for k in range(2000):
         record.add(k * NANOSECONDS, Pose2(k, 0.0, 0.0))
@@ -128,7 +128,7 @@ def test_a_drive_that_begins_anew_begins_before_its_first_reading() -> None:
 
 
 @pytest.mark.parametrize('patient', [False, True])
-def test_an_associator_knows_all_odometry_of_a_long_drive(patient: bool) -> None:
+def test_associator_keeps_all_odometry_of_a_long_drive(patient: bool) -> None:
     associator = PoseAssociator(lambda base, frame, stamp: Pose2(0, 0, 0), patient=patient)
     for k in range(2000):
         associator.add_odometry(OdometryMessage(k * NANOSECONDS, 'odom', 'base', Pose2(0.1 * k, 0.0, 0.0)))

@@ -1,4 +1,4 @@
-"""No message waits for work on all readings: placing, moving and thinning go in portions, or aside."""
+"""Placing, moving and thinning of readings is done in portions or in the background, so that no message waits long."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def settled(p: PoseAssociator) -> int:
 
 
 def portions(p: PoseAssociator, most: int = AT_ONCE) -> int:
-    """Let it go on until nothing is left; no call may settle more than `most` readings."""
+    """Continue until nothing is left; no call may settle more than `most` readings."""
     count = 0
     while p.behind:
         before = settled(p)
@@ -42,7 +42,7 @@ def portions(p: PoseAssociator, most: int = AT_ONCE) -> int:
     return count
 
 
-def test_odometry_after_a_long_silence_places_readings_in_portions() -> None:
+def test_odometry_after_a_long_gap_places_readings_in_portions() -> None:
     p = PoseAssociator(lambda base, frame, stamp: Pose2(0.0, 0.0, 0.0), at_once=AT_ONCE, clock=lambda: 0.0)
     p.add_odometry(odometry(0.0))
     for k in range(5000):
@@ -54,7 +54,7 @@ def test_odometry_after_a_long_silence_places_readings_in_portions() -> None:
     assert np.all(np.diff(p.readings.stamp) > 0)
 
 
-def test_readings_that_time_out_together_go_in_portions() -> None:
+def test_readings_that_time_out_together_are_rejected_in_portions() -> None:
     now = [0.0]
     p = PoseAssociator(lambda base, frame, stamp: None, at_once=AT_ONCE, clock=lambda: now[0])
     for k in range(1000):
@@ -67,12 +67,12 @@ def test_readings_that_time_out_together_go_in_portions() -> None:
 
 
 @pytest.mark.parametrize('known', [True, False])
-def test_poses_that_become_known_are_asked_for_in_portions(known: bool) -> None:
-    now, asked = [0.0], [0]
+def test_poses_of_waiting_readings_are_looked_up_in_portions(known: bool) -> None:
+    now, lookups = [0.0], [0]
     answer: list[Any] = [LATER]
 
     def pose(base: str, frame: str, stamp: int) -> Any:
-        asked[0] += 1
+        lookups[0] += 1
         return answer[0]
 
     p = PoseAssociator(pose, at_once=AT_ONCE, clock=lambda: now[0])
@@ -85,15 +85,15 @@ def test_poses_that_become_known_are_asked_for_in_portions(known: bool) -> None:
     if known:
         answer[0] = Pose2(0.0, 0.0, 0.0)
     now[0] = 50.0
-    asked[0] = 0
+    lookups[0] = 0
     p.add_odometry(odometry(1.5 if known else 50.0))
-    assert p.behind and asked[0] <= AT_ONCE
+    assert p.behind and lookups[0] <= AT_ONCE
     portions(p)
     assert p.waiting == 0
     assert (len(p.buffer), p.rejected['unknown_extrinsics']) == ((800, 0) if known else (0, 800))
 
 
-def test_a_jump_back_counts_what_waits_by_frame() -> None:
+def test_jump_back_of_time_rejects_waiting_readings_by_frame() -> None:
     p = PoseAssociator(lambda base, frame, stamp: Pose2(0.0, 0.0, 0.0), at_once=AT_ONCE, clock=lambda: 0.0)
     p.add_odometry(odometry(100.0))
     for k in range(300):
@@ -111,7 +111,7 @@ def append(buffer: ReadingBuffer, first: int, count: int) -> None:
 
 
 @pytest.mark.parametrize('restored', [0, 16_000, 12_300, 16_384])
-def test_columns_grow_without_one_large_copy(monkeypatch: pytest.MonkeyPatch, restored: int) -> None:
+def test_columns_grow_in_small_copies(monkeypatch: pytest.MonkeyPatch, restored: int) -> None:
     monkeypatch.setattr(reading_buffer, 'LARGE', 4096)
     moved: list[int] = []
     move = ReadingBuffer._move
@@ -133,8 +133,8 @@ def test_columns_grow_without_one_large_copy(monkeypatch: pytest.MonkeyPatch, re
     assert buffer.counts() == {'s': (100_000, 50_000)}
 
 
-def test_thinning_aside_keeps_nobody_waiting_and_loses_nothing() -> None:
-    """What is held is the same whether appending waits for it or not, and whatever comes meanwhile."""
+def test_thinning_in_the_background_loses_no_readings() -> None:
+    """The kept readings are the same whether appending waits for thinning or not."""
     bound = 200
     aside: list[tuple[Callable[[], Any], Callable[[Any], None]]] = []
     ours, waiting = ReadingBuffer(bound), ReadingBuffer(bound)
@@ -157,7 +157,7 @@ def test_thinning_aside_keeps_nobody_waiting_and_loses_nothing() -> None:
     assert np.array_equal(ours.bounded().x, waiting.bounded().x)
 
 
-def test_thinning_that_fails_or_comes_too_late() -> None:
+def test_thinning_that_fails_or_ends_after_a_reset_changes_nothing() -> None:
     aside: list[tuple[Callable[[], Any], Callable[[Any], None]]] = []
     buffer = ReadingBuffer(100)
     buffer.aside = lambda thin, done: aside.append((thin, done))
@@ -177,7 +177,7 @@ def test_thinning_that_fails_or_comes_too_late() -> None:
 
 
 class Clock:
-    """A clock that the test moves."""
+    """A clock set by the test."""
 
     now = 0.0
 
@@ -185,8 +185,8 @@ class Clock:
         return self.now
 
 
-def test_ranges_that_overtake_odometry_wait_as_long_as_it_comes() -> None:
-    """Odometry that is 20 s behind in the middleware, and keeps coming."""
+def test_ranges_ahead_of_odometry_wait_while_odometry_keeps_coming() -> None:
+    """Odometry that the middleware delivers 20 s late, without a gap."""
     clock = Clock()
     p = PoseAssociator(lambda base, frame, stamp: Pose2(0.0, 0.0, 0.0), Parameters(), clock=clock)
     lag = 20.0
@@ -200,7 +200,7 @@ def test_ranges_that_overtake_odometry_wait_as_long_as_it_comes() -> None:
     assert p.waiting == 400 - len(p.buffer)
 
 
-def test_a_clock_that_is_ahead_is_told_from_odometry_that_is_behind() -> None:
+def test_ranges_of_a_clock_ahead_are_rejected_and_late_odometry_is_not() -> None:
     clock = Clock()
     p = PoseAssociator(lambda base, frame, stamp: Pose2(0.0, 0.0, 0.0), Parameters(), clock=clock)
     for k in range(200):
@@ -222,7 +222,7 @@ def test_readings_time_out_once_odometry_stops() -> None:
     assert p.rejected['no_odometry'] > 60
 
 
-def test_an_hour_of_lag_does_not_pile_up() -> None:
+def test_ranges_with_stamps_an_hour_ahead_do_not_accumulate() -> None:
     """A range whose publisher's clock, but not its stamps, is an hour ahead of odometry's."""
     clock = Clock()
     p = PoseAssociator(lambda base, frame, stamp: Pose2(0.0, 0.0, 0.0), Parameters(), clock=clock)

@@ -1,4 +1,4 @@
-"""Pose association of readings: REP 117, interpolation, waiting, and the account of every message."""
+"""Pose association of readings: REP 117, interpolation, waiting, and the count of each message."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def odometry(seconds: float, x: float = 0.0, y: float = 0.0, yaw: float = 0.0) -
 
 
 class Clock:
-    """A clock that the test moves."""
+    """A clock set by the test."""
 
     now = 0.0
 
@@ -78,7 +78,7 @@ def accounted(p: PoseAssociator) -> bool:
         ({'frame_id': 'a\n\x1b[31mX'}, 'unprintable_frame_id'),
     ],
 )
-def test_rejections_of_rep_117(changes: dict[str, object], reason: str) -> None:
+def test_bad_range_is_rejected_with_reason(changes: dict[str, object], reason: str) -> None:
     assert measure(sonar(**changes), Parameters().association) == reason
     p = associator()
     p.add_range(sonar(**changes))
@@ -87,7 +87,7 @@ def test_rejections_of_rep_117(changes: dict[str, object], reason: str) -> None:
 
 
 @pytest.mark.parametrize('value', [4.0, 4.5, INF])
-def test_out_of_range_is_no_echo_or_discarded(value: float) -> None:
+def test_range_above_the_largest_is_no_echo_or_discarded(value: float) -> None:
     measured = measure(sonar(range=value), Parameters().association)
     assert not isinstance(measured, str)
     assert measured.z == measured.z_max == 4.0
@@ -95,7 +95,7 @@ def test_out_of_range_is_no_echo_or_discarded(value: float) -> None:
     assert measure(sonar(range=value), discard) == 'over_range'
 
 
-def test_fixed_distance_rangers() -> None:
+def test_ranges_of_fixed_distance_rangers() -> None:
     fixed = sonar(min_range=0.8, max_range=0.8)
     clear = measure(fixed._replace(range=INF), Parameters().association)
     detected = measure(fixed._replace(range=-INF), Parameters().association)
@@ -105,14 +105,14 @@ def test_fixed_distance_rangers() -> None:
     assert 0 < detected.z - 5 * detected.sigma < detected.z + 5 * detected.sigma < 0.8
 
 
-def test_variance_and_overrides() -> None:
+def test_variance_and_parameters_that_override_the_message() -> None:
     p = Parameters.from_flat({'field_of_view': 0.5, 'max_range': 2.0}).association
     measured = measure(sonar(variance=0.04, field_of_view=0.0, range=3.0), p)
     assert not isinstance(measured, str)
     assert (measured.sigma, measured.half_angle, measured.z, measured.z_max) == (0.2, 0.25, 2.0, 2.0)
 
 
-def test_poses_are_interpolated_and_the_extrinsics_are_added() -> None:
+def test_pose_of_a_reading_is_interpolated_odometry_and_mount() -> None:
     p = associator()
     p.add_odometry(odometry(10.0, 1.0, 2.0, 3.0))
     p.add_range(sonar(10.25))
@@ -127,7 +127,7 @@ def test_poses_are_interpolated_and_the_extrinsics_are_added() -> None:
     assert (p.map_frame, p.base_frame) == ('odom', 'base_link')
 
 
-def test_reasons_of_time() -> None:
+def test_readings_without_pose_are_rejected_with_reason() -> None:
     clock = Clock()
     p = associator(clock=clock, max_pose_gap=0.5, pose_timeout=1.0)
     p.add_range(sonar(0.5))
@@ -147,16 +147,16 @@ def test_reasons_of_time() -> None:
     assert set(p.rejected) <= set(REASONS)
 
 
-def test_a_reading_times_out_by_stamps_and_by_the_clock() -> None:
+def test_reading_times_out_by_stamps_and_by_the_clock() -> None:
     clock = Clock()
     fast, still = associator(clock=clock), associator(clock=clock)
     for p in (fast, still):
         p.add_odometry(odometry(0.0))
         p.add_range(sonar(0.1))
-    # a bag replayed fast: the stamps run on, the clock hardly
+    # a bag replayed fast: stamps advance quickly, the clock hardly
     fast.add_range(sonar(60.0))
     assert fast.waiting == 2
-    # a simulation that stands still: the clock runs on
+    # a simulation at standstill: the clock advances, stamps do not
     clock.now = 100.0
     still.add_range(sonar(0.1))
     assert still.waiting == 2
@@ -166,7 +166,7 @@ def test_a_reading_times_out_by_stamps_and_by_the_clock() -> None:
         assert not p.rejected
 
 
-def test_a_pose_that_becomes_known_later_is_waited_for() -> None:
+def test_reading_waits_for_a_mount_that_becomes_known_later() -> None:
     clock, known = Clock(), {'sonar'}
     p = PoseAssociator(lambda base, frame, stamp: SENSOR if frame in known else LATER, clock=clock)
     p.add_odometry(odometry(0.0))
@@ -183,14 +183,14 @@ def test_a_pose_that_becomes_known_later_is_waited_for() -> None:
     assert accounted(p)
 
 
-def test_an_exact_stamp_needs_no_bracket() -> None:
+def test_reading_with_the_stamp_of_a_pose_is_placed_at_once() -> None:
     p = associator()
     p.add_odometry(odometry(5.0, 1.0))
     p.add_range(sonar(5.0))
     assert len(p.buffer) == 1
 
 
-def test_unknown_extrinsics_are_counted_and_named() -> None:
+def test_readings_of_unknown_frames_are_counted_and_named() -> None:
     p = associator()
     p.add_odometry(odometry(0.0))
     p.add_range(sonar(0.0, frame_id='mystery'))
@@ -199,7 +199,7 @@ def test_unknown_extrinsics_are_counted_and_named() -> None:
     assert p.rejected_by_frame['mystery']['unknown_extrinsics'] == 1
 
 
-def test_a_jump_back_drops_what_waits_and_keeps_the_readings() -> None:
+def test_jump_back_of_time_rejects_waiting_readings_and_keeps_others() -> None:
     p = associator()
     for second in (100.0, 100.5, 101.0):
         p.add_odometry(odometry(second))
@@ -215,7 +215,7 @@ def test_a_jump_back_drops_what_waits_and_keeps_the_readings() -> None:
     assert accounted(p)
 
 
-def test_odometry_that_overtakes_is_sorted_in() -> None:
+def test_odometry_out_of_order_is_sorted() -> None:
     p = associator()
     for second, x in ((0.0, 0.0), (0.4, 4.0), (0.2, 1.0)):
         p.add_odometry(odometry(second, x))
@@ -223,7 +223,7 @@ def test_odometry_that_overtakes_is_sorted_in() -> None:
     assert p.readings.x[0] == pytest.approx(0.5 + SENSOR.x)
 
 
-def test_bad_odometry_is_counted() -> None:
+def test_bad_odometry_is_rejected_with_reason() -> None:
     p = associator()
     p.add_odometry(odometry(0.0)._replace(pose=None))
     p.add_odometry(odometry(0.0))
@@ -231,25 +231,25 @@ def test_bad_odometry_is_counted() -> None:
     assert p.odometry_rejected == {'bad_pose': 1, 'other_frame': 1}
 
 
-def test_an_absurd_pose_is_refused() -> None:
+def test_pose_at_a_million_metres_is_rejected() -> None:
     p = associator()
     for second, x in ((0.0, 0.0), (0.1, 1e6), (0.2, 1e9), (0.3, 0.0)):
         p.add_odometry(odometry(second, x))
         p.add_range(sonar(second))
-    # nothing was ever at 1e6 m, or half way back
+    # the robot was never at 1e6 m or half way there
     assert p.rejected == {'pose_jump': 2}
     assert p.odometry_rejected == {'bad_pose': 1}
     assert len(p.buffer) == 2
 
 
-def test_a_long_max_range_does_not_matter_where_echoes_are_near() -> None:
+def test_large_max_range_with_a_near_echo_is_accepted() -> None:
     p = associator(max_cells=10_000)
     p.add_odometry(odometry(0.0))
     p.add_range(sonar(0.0, max_range=3e38))
     assert len(p.buffer) == 1
 
 
-def test_odometry_kept_is_bounded_unless_patient() -> None:
+def test_history_of_odometry_is_bounded_unless_patient() -> None:
     p, q = associator(), associator(patient=True)
     for k in range(50_000):
         p.add_odometry(odometry(0.05 * k))
@@ -260,7 +260,7 @@ def test_odometry_kept_is_bounded_unless_patient() -> None:
 
 @settings(max_examples=60, deadline=None)
 @given(st.integers(0, 2**32 - 1))
-def test_a_patient_associator_does_not_care_about_interleaving(seed: int) -> None:
+def test_patient_result_does_not_depend_on_the_order_of_topics(seed: int) -> None:
     rng = random.Random(seed)
     poses = [odometry(0.1 * k + 0.01 * rng.random(), k, -k, 0.1 * k) for k in range(30) if rng.random() < 0.8]
     ranges = [sonar(3.2 * rng.random() - 0.1, range=rng.choice([1.0, 2.0, INF, NAN])) for _ in range(60)]
@@ -276,7 +276,7 @@ def test_a_patient_associator_does_not_care_about_interleaving(seed: int) -> Non
 
     merged = [*poses, *ranges]
     merged.sort(key=lambda m: m.stamp)
-    # each stream in order, the two mixed at will
+    # each topic in order, the two interleaved at random
     mixed, a, b = [], list(poses), sorted(ranges, key=lambda m: m.stamp)
     while a or b:
         mixed.append((a if a and (not b or rng.random() < 0.5) else b).pop(0))
@@ -313,7 +313,7 @@ def test_a_patient_associator_does_not_care_about_interleaving(seed: int) -> Non
         max_size=40,
     )
 )
-def test_any_messages_are_accounted_for(messages: list[RangeMessage | OdometryMessage]) -> None:
+def test_all_messages_are_accounted_for(messages: list[RangeMessage | OdometryMessage]) -> None:
     p = associator()
     for message in messages:
         (p.add_range if isinstance(message, RangeMessage) else p.add_odometry)(message)
@@ -325,7 +325,7 @@ def test_any_messages_are_accounted_for(messages: list[RangeMessage | OdometryMe
         assert np.isfinite(getattr(p.readings, column)).all()
 
 
-def test_a_dead_sensor_does_not_wall_in_the_robot() -> None:
+def test_zero_ranges_of_a_dead_sensor_are_rejected() -> None:
     p = associator()
     for second in range(5):
         p.add_odometry(odometry(second))
@@ -334,8 +334,8 @@ def test_a_dead_sensor_does_not_wall_in_the_robot() -> None:
 
 
 @pytest.mark.parametrize('patient', [False, True])
-def test_a_wild_pose_does_not_make_the_map_huge(patient: bool) -> None:
-    """Poses and readings of equal stamps, as where a driver stamps both with the time of a cycle."""
+def test_outlier_of_odometry_does_not_extend_the_map(patient: bool) -> None:
+    """Poses and readings have equal stamps, as of a driver that stamps both with the time of its cycle."""
     p = associator(patient)
     for k in range(40):
         wild = k == 20
@@ -348,7 +348,7 @@ def test_a_wild_pose_does_not_make_the_map_huge(patient: bool) -> None:
     assert accounted(p)
 
 
-def test_a_jump_of_ten_kilometres_costs_what_comes_after_it_and_no_memory() -> None:
+def test_readings_after_a_jump_of_ten_kilometres_are_rejected() -> None:
     p = associator()
     for second in range(20):
         p.add_odometry(odometry(second, 0.1 * second + (10_000.0 if second >= 10 else 0.0)))
@@ -363,7 +363,7 @@ def test_a_jump_of_ten_kilometres_costs_what_comes_after_it_and_no_memory() -> N
     assert len(p.buffer) == 1
 
 
-def test_a_cone_of_millions_of_cells_is_refused() -> None:
+def test_cone_of_millions_of_cells_is_rejected() -> None:
     p = associator()
     p.add_odometry(odometry(0.0))
     p.add_range(sonar(0.0, range=300.0, max_range=1000.0, field_of_view=2.0))
@@ -371,7 +371,7 @@ def test_a_cone_of_millions_of_cells_is_refused() -> None:
     assert (p.rejected, len(p.buffer)) == ({'large_cone': 1}, 1)
 
 
-def test_a_sensor_whose_clock_is_ahead_does_not_pile_up() -> None:
+def test_readings_of_a_sensor_with_clock_ahead_do_not_accumulate() -> None:
     clock = Clock()
     p = associator(clock=clock)
     for tenth in range(200):
@@ -385,7 +385,7 @@ def test_a_sensor_whose_clock_is_ahead_does_not_pile_up() -> None:
     assert accounted(p)
 
 
-def test_odometry_that_stands_still_lets_readings_wait() -> None:
+def test_readings_wait_while_odometry_has_constant_stamps() -> None:
     clock = Clock()
     p = associator(clock=clock)
     p.add_odometry(odometry(1.0))
@@ -398,7 +398,7 @@ def test_odometry_that_stands_still_lets_readings_wait() -> None:
 
 
 @pytest.mark.parametrize('rate', [1, 1000])
-def test_rates_of_odometry(rate: int) -> None:
+def test_readings_are_placed_at_any_rate_of_odometry(rate: int) -> None:
     p = associator()
     for k in range(5 * rate + 1):
         p.add_odometry(odometry(k / rate, k / rate))
@@ -409,18 +409,18 @@ def test_rates_of_odometry(rate: int) -> None:
     assert p.readings.x == pytest.approx(p.readings.stamp / NANOSECONDS + 0.2)
 
 
-def test_a_gap_of_an_hour_is_not_bridged() -> None:
+def test_readings_in_a_gap_of_an_hour_are_rejected() -> None:
     p = associator()
     for second in (0.0, 0.5, 3600.0, 3600.5):
         p.add_odometry(odometry(second))
     for second in (0.25, 1.0, 1800.0, 3599.0, 3600.25):
         p.add_range(sonar(second))
-    # 0.25 s is so far back that its odometry is forgotten, unless little of it came
+    # odometry at 0.25 s is forgotten by then, unless few poses came
     assert p.rejected == {'pose_gap': 3}
     assert len(p.buffer) == 2
 
 
-def test_one_stamp_from_the_future_costs_only_what_waits() -> None:
+def test_one_stamp_from_the_future_rejects_only_waiting_readings() -> None:
     p = associator()
     for second in range(10):
         p.add_odometry(odometry(1e9 if second == 5 else second))
@@ -433,13 +433,13 @@ def test_one_stamp_from_the_future_costs_only_what_waits() -> None:
 
 @pytest.mark.parametrize('patient', [False, True])
 @pytest.mark.parametrize('ahead', [1.5, 5.0, 1e9])
-def test_one_stamp_from_the_future_leaves_the_odometry_of_the_drive(patient: bool, ahead: float) -> None:
+def test_one_stamp_from_the_future_keeps_the_odometry(patient: bool, ahead: float) -> None:
     p = associator(patient)
     for k in range(200):
         second = 0.1 * k
         p.add_odometry(odometry(second + (ahead if k in (100, 150) else 0.0), second))
         p.add_range(sonar(second))
-    # a reading that is late by a minute still has a pose
+    # a reading that comes a minute late still gets a pose
     p.add_range(sonar(5.05))
     p.finish()
     stamps = [round(0.1 * k * NANOSECONDS) for k in range(200) if k not in (100, 150)]
@@ -451,7 +451,7 @@ def test_one_stamp_from_the_future_leaves_the_odometry_of_the_drive(patient: boo
 
 
 @pytest.mark.parametrize('back', [1.5, 5.0, 19.0])
-def test_a_clock_that_jumps_back_is_noticed_at_once(back: float) -> None:
+def test_clock_that_jumps_back_is_detected_at_once(back: float) -> None:
     p = associator()
     for k in range(200):
         p.add_odometry(odometry(20.0 + 0.1 * k))
@@ -459,7 +459,7 @@ def test_a_clock_that_jumps_back_is_noticed_at_once(back: float) -> None:
     assert (p.time_jumps, p.odometry_rejected, len(p.record)) == (1, {}, 1)
 
 
-def test_a_clock_that_is_set_ahead_and_back_again() -> None:
+def test_clock_set_ahead_and_back_is_one_jump() -> None:
     p = associator()
     for second in (10.0, 10.1, 70.2, 70.3, 10.4, 10.5):
         p.add_odometry(odometry(second))
@@ -467,7 +467,7 @@ def test_a_clock_that_is_set_ahead_and_back_again() -> None:
     assert p.odometry[0].tolist() == [10_400_000_000, 10_500_000_000]
 
 
-def test_two_clocks_on_one_topic_leave_one() -> None:
+def test_one_of_two_clocks_on_one_topic_is_used() -> None:
     p = associator()
     for k in range(100):
         p.add_odometry(odometry(20.0 + 0.1 * k))
@@ -477,14 +477,14 @@ def test_two_clocks_on_one_topic_leave_one() -> None:
     assert len(p.record) == 100
 
 
-def test_a_stamp_that_was_never_filled_in_is_told_apart() -> None:
+def test_stamp_zero_is_rejected_with_its_own_reason() -> None:
     p = associator()
     p.add_odometry(odometry(100.0))
     p.add_range(sonar(0.0))
     p.add_range(sonar(99.0))
     assert p.rejected == {'zero_stamp': 1, 'before_odometry': 1}
     assert 'set it in the driver' in REASONS['zero_stamp']
-    # where time begins with 0, it is a stamp as any other
+    # if time begins with 0, it is a normal stamp
     p = associator()
     p.add_odometry(odometry(0.0))
     p.add_range(sonar(0.0))
@@ -492,7 +492,7 @@ def test_a_stamp_that_was_never_filled_in_is_told_apart() -> None:
 
 
 @pytest.mark.parametrize('reset', [False, True])
-def test_a_reading_from_the_future_stops_no_clock(reset: bool) -> None:
+def test_reading_from_the_future_does_not_delay_others(reset: bool) -> None:
     clock = Clock()
 
     def extrinsics(base: str, frame: str, stamp: int) -> Pose2 | Later:
@@ -511,7 +511,7 @@ def test_a_reading_from_the_future_stops_no_clock(reset: bool) -> None:
     assert len(p.buffer) == p.received - p.waiting - sum(p.rejected.values()) > 90
 
 
-def test_odometry_whose_stamp_stands_still_times_readings_out() -> None:
+def test_readings_time_out_if_odometry_has_constant_stamps() -> None:
     clock = Clock()
     p = associator(clock=clock)
     for k in range(200):
@@ -523,7 +523,7 @@ def test_odometry_whose_stamp_stands_still_times_readings_out() -> None:
     assert p.rejected['no_odometry'] == p.received - p.waiting
 
 
-def test_what_strangers_can_make_grow_is_bounded() -> None:
+def test_counts_by_frame_are_bounded() -> None:
     p = associator()
     for k in range(2 * MOST_FRAMES):
         p.reject(sonar(0.0, frame_id=f'frame {k}'), 'paused')
@@ -534,7 +534,7 @@ def test_what_strangers_can_make_grow_is_bounded() -> None:
     assert sum(sum(counts.values()) for counts in p.rejected_by_frame.values()) == sum(p.rejected.values())
 
 
-def test_a_reset_begins_with_the_odometry_that_comes() -> None:
+def test_reset_with_another_odometry_frame_starts_again() -> None:
     p = associator()
     p.add_odometry(odometry(0.0)._replace(frame_id='garbage'))
     for second in (1.0, 1.5):
@@ -546,13 +546,13 @@ def test_a_reset_begins_with_the_odometry_that_comes() -> None:
         p.add_odometry(odometry(second))
     p.add_range(sonar(2.2))
     assert (p.map_frame, len(p.buffer), p.odometry_rejected) == ('odom', 1, {})
-    # otherwise it is kept, so that the next reading can be placed
+    # otherwise odometry is kept, so that the next reading can be placed
     p.clear()
     p.add_range(sonar(2.3))
     assert (p.map_frame, len(p.buffer)) == ('odom', 1)
 
 
-def test_a_reset_after_another_frame_begins_with_its_clock_too() -> None:
+def test_reset_with_another_odometry_frame_forgets_the_clock() -> None:
     clock = Clock()
     p = associator(clock=clock)
     p.add_odometry(odometry(1e6)._replace(frame_id='garbage'))

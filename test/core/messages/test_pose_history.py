@@ -1,4 +1,4 @@
-"""Poses of the robot over time."""
+"""Poses of the robot over time: interpolation, outliers, and the poses that are forgotten."""
 
 from __future__ import annotations
 
@@ -27,12 +27,12 @@ def history(*poses: tuple[float, Pose2]) -> PoseHistory:
     return made
 
 
-def test_yaw_goes_the_shortest_way() -> None:
+def test_yaw_is_interpolated_the_shorter_way() -> None:
     pose = interpolate(Pose2(0.0, 2.0, 3.1), Pose2(1.0, 4.0, -3.1), 0.25)
     assert pose == pytest.approx((0.25, 2.5, 3.1 + 0.25 * (2 * math.pi - 6.2)))
 
 
-def test_poses_in_any_order_and_the_last_of_one_stamp() -> None:
+def test_poses_in_any_order_are_sorted_and_equal_stamps_replaced() -> None:
     made = history((2.0, Pose2(2, 0, 0)), (1.0, Pose2(1, 0, 0)), (1.5, Pose2(9, 0, 0)), (1.5, Pose2(1.5, 0, 0)))
     assert (len(made), made.newest) == (3, 2 * SECOND)
     assert made.at(round(1.25 * SECOND), 1.0) == pytest.approx((1.25, 0, 0))
@@ -41,7 +41,7 @@ def test_poses_in_any_order_and_the_last_of_one_stamp() -> None:
     assert (len(made), made.newest) == (0, None)
 
 
-def test_reasons_why_there_is_no_pose() -> None:
+def test_stamp_without_pose_gives_a_reason() -> None:
     made = history((1.0, Pose2(0, 0, 0)), (3.0, Pose2(0, 0, 0)), (3.1, Pose2(11.5, 0, 0)), (3.2, Pose2(0.6, 0, 0)))
     assert made.at(SECOND - 1, 9.0) == 'before_odometry'
     assert made.at(0, 9.0) == 'zero_stamp'
@@ -51,7 +51,7 @@ def test_reasons_why_there_is_no_pose() -> None:
     assert isinstance(made.at(round(3.15 * SECOND), 9.0), Pose2), '10.9 m in 0.1 s: a drive and one correction'
 
 
-def test_a_wild_pose_gives_no_reading_a_place_not_even_one_of_its_own_stamp() -> None:
+def test_outlier_places_no_reading_even_at_its_own_stamp() -> None:
     made = history((1.0, Pose2(0, 0, 0)), (1.1, Pose2(600, 400, 0)), (1.2, Pose2(0.1, 0, 0)), (1.3, Pose2(0.2, 0, 0)))
     assert made.at(round(1.1 * SECOND), 1.0) == 'pose_jump'
     assert made.at(round(1.15 * SECOND), 1.0) == 'pose_jump'
@@ -59,26 +59,26 @@ def test_a_wild_pose_gives_no_reading_a_place_not_even_one_of_its_own_stamp() ->
     assert made.at(round(1.3 * SECOND), 1.0) == Pose2(0.2, 0, 0)
 
 
-def test_a_correction_costs_the_readings_of_one_stamp() -> None:
+def test_correction_of_odometry_rejects_readings_of_one_stamp() -> None:
     made = history(*((0.1 * k, Pose2(0.1 * k + (50.0 if k >= 5 else 0.0), 0, 0)) for k in range(10)))
     found = [made.at(round(0.1 * k * SECOND), 1.0) for k in range(10)]
     assert [k for k, pose in enumerate(found) if pose == 'pose_jump'] == [5]
 
 
-def test_the_first_pose_is_taken_as_it_is() -> None:
+def test_first_pose_is_always_accepted() -> None:
     made = history((1.0, Pose2(600, 0, 0)), (1.1, Pose2(0, 0, 0)), (1.2, Pose2(0.1, 0, 0)))
     assert made.at(SECOND, 1.0) == Pose2(600, 0, 0)
     assert made.at(round(1.1 * SECOND), 1.0) == 'pose_jump'
     assert made.at(round(1.2 * SECOND), 1.0) == Pose2(0.1, 0, 0)
 
 
-def test_a_turn_over_a_right_angle_goes_the_same_way() -> None:
+def test_yaw_of_a_large_turn_is_interpolated_the_shorter_way() -> None:
     assert interpolate(Pose2(0, 0, 0.0), Pose2(0, 0, 3.0), 0.5).yaw == pytest.approx(1.5)
     assert interpolate(Pose2(0, 0, 0.0), Pose2(0, 0, -3.0), 0.5).yaw == pytest.approx(-1.5)
 
 
-def test_old_poses_go() -> None:
-    """By halves, the latest of more than `HISTORY` stays, and each stamp keeps its pose."""
+def test_old_poses_are_forgotten() -> None:
+    """Half of the poses are forgotten at a time, `HISTORY` is kept, and each stamp keeps its pose."""
     made = PoseHistory()
     longest = 0
     for k in range(MOST_POSES + 1):
@@ -103,7 +103,7 @@ def test_old_poses_go() -> None:
     assert made.at(100 * SECOND, 10.0) == 'before_odometry'
 
 
-def test_few_poses_are_kept_however_old() -> None:
+def test_few_poses_are_kept_at_any_age() -> None:
     made = history(*((100.0 * k, Pose2(k, 0, 0)) for k in range(FEWEST + 1)))
     made.trim()
     assert len(made) == FEWEST + 1
@@ -115,7 +115,7 @@ def test_few_poses_are_kept_however_old() -> None:
     assert len(made) == 3
 
 
-def test_what_a_robot_may_do_at_most() -> None:
+def test_step_at_the_limit_of_speed_is_accepted_and_above_is_not() -> None:
     farthest = STRIDE + 2 * FASTEST
     made = history((1.0, Pose2(0, 0, 0)), (3.0, Pose2(farthest, 0, 0)), (5.0, Pose2(2 * farthest + 0.1, 0, 0)))
     assert made.at(2 * SECOND, 2.0) == Pose2(farthest / 2, 0, 0)
@@ -123,21 +123,21 @@ def test_what_a_robot_may_do_at_most() -> None:
     assert (FASTEST, STRIDE, HISTORY) == (100.0, 1.0, 600 * SECOND)
 
 
-def test_a_wild_pose_is_undone_by_the_next_of_its_stamp() -> None:
+def test_outlier_is_replaced_by_the_next_pose_of_its_stamp() -> None:
     made = history((1.0, Pose2(0, 0, 0)), (1.1, Pose2(900, 0, 0)), (1.1, Pose2(0.1, 0, 0)))
     assert (len(made), made.at(round(1.1 * SECOND), 1.0)) == (2, Pose2(0.1, 0, 0))
-    # three that agree with each other, after a correction
+    # three poses that agree, after a correction
     made = history(*((1.0 + 0.1 * k, Pose2(50.0 * (k > 2), 0, 0)) for k in range(6)))
     assert made.at(round(1.3 * SECOND), 1.0) == 'pose_jump'
     assert made.at(round(1.4 * SECOND), 1.0) == Pose2(50, 0, 0)
-    # two wild poses, then back: those before them are too long ago
+    # two outliers, then back: the poses before them are too old
     made = history(*((1.0 + 0.1 * k, Pose2(50.0 * (k in (1, 2)) * k, 0, 0)) for k in range(5)))
     assert made.at(round(1.3 * SECOND), 1.0) == 'pose_jump'
     assert made.at(round(1.4 * SECOND), 1.0) == Pose2(0, 0, 0)
 
 
 @pytest.mark.parametrize('again', [False, True])
-def test_the_newest_pose_can_be_forgotten(again: bool) -> None:
+def test_newest_pose_can_be_dropped(again: bool) -> None:
     made = history((1.0, Pose2(1, 0, 0)), (1.1, Pose2(2, 0, 0)), (9.0, Pose2(3, 0, 0)))
     if again:
         made.add(9 * SECOND, Pose2(4, 0, 0))
@@ -149,7 +149,7 @@ def test_the_newest_pose_can_be_forgotten(again: bool) -> None:
     assert before[0][-1] == 9 * SECOND, 'a snapshot never changes'
 
 
-def test_a_record_that_began_anew_with_the_pose_that_is_forgotten() -> None:
+def test_dropped_pose_after_a_new_drive_is_not_counted() -> None:
     made = history((1.0, Pose2(1, 0, 0)), (9.0, Pose2(3, 0, 0)))
     made.record.begin_anew()
     made.drop_newest()

@@ -1,4 +1,4 @@
-"""The rotation of a quaternion, against the product of quaternions, and the heading of its x axis."""
+"""Rotation of a quaternion, compared with the product of quaternions, and the heading of its x axis."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def product(a: XYZW, b: XYZW) -> XYZW:
 
 
 @pytest.mark.parametrize('seed', range(10))
-def test_a_vector_is_turned_as_by_the_product(seed: int) -> None:
+def test_rotation_of_a_vector_equals_the_quaternion_product(seed: int) -> None:
     rng = np.random.default_rng(seed)
     x, y, z, w = (rng.normal(size=4)).tolist()
     length = math.sqrt(x * x + y * y + z * z + w * w)
@@ -41,7 +41,7 @@ def test_a_vector_is_turned_as_by_the_product(seed: int) -> None:
 
 
 @pytest.mark.parametrize('scale', [1.0 - 0.49 * TOLERANCE, 1.0 + 0.49 * TOLERANCE])
-def test_a_length_of_nearly_one_is_made_one(scale: float) -> None:
+def test_quaternion_of_length_near_one_is_normalised(scale: float) -> None:
     half = 0.3
     rotation = rotation_of(0.0, 0.0, scale * math.sin(half), scale * math.cos(half))
     assert rotation is not None
@@ -50,13 +50,13 @@ def test_a_length_of_nearly_one_is_made_one(scale: float) -> None:
 
 
 @pytest.mark.parametrize('scale', [0.0, 1.0 - 0.51 * TOLERANCE, 1.0 + 0.51 * TOLERANCE, 2.0, math.nan, math.inf])
-def test_other_lengths_are_refused(scale: float) -> None:
+def test_quaternion_of_other_length_is_rejected(scale: float) -> None:
     q = tuple(scale * 0.5 for _ in range(4))
     assert rotation_of(*q) is None and yaw_of(*q) is None
     assert TOLERANCE == 0.01
 
 
-def test_elevation_and_heading() -> None:
+def test_elevation_and_heading_of_a_vector() -> None:
     assert elevation_of(3.0, 4.0, 5.0) == pytest.approx(math.pi / 4)
     assert elevation_of(3.0, 4.0, -5.0) == pytest.approx(-math.pi / 4)
     assert heading_of(-1.0, 2.0, 0.1) == math.atan2(2.0, -1.0)
@@ -68,13 +68,13 @@ def test_elevation_and_heading() -> None:
 
 @pytest.mark.parametrize('yaw', [-3.0, -1.0, 0.0, 0.5, 2.0])
 @pytest.mark.parametrize('pitch', [-1.0, 0.0, 0.4])
-def test_the_yaw_is_that_of_the_x_axis(yaw: float, pitch: float) -> None:
+def test_yaw_is_that_of_the_x_axis(yaw: float, pitch: float) -> None:
     turn = (0.0, 0.0, math.sin(yaw / 2), math.cos(yaw / 2))
     nod = (0.0, math.sin(pitch / 2), 0.0, math.cos(pitch / 2))
     roll = (math.sin(0.7), 0.0, 0.0, math.cos(0.7))
     assert yaw_of(*product(product(turn, nod), roll)) == pytest.approx(yaw)
 
 
-def test_an_x_axis_that_stands_on_end_has_no_yaw() -> None:
+def test_steep_x_axis_has_no_yaw() -> None:
     assert yaw_of(0.0, math.sin(0.6), 0.0, math.cos(0.6)) is None
     assert yaw_of(0.0, math.sin(0.5), 0.0, math.cos(0.5)) == pytest.approx(0.0)

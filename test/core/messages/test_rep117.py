@@ -1,4 +1,4 @@
-"""What a Range message says at the very limits of what is admitted."""
+"""Measurements of `Range` messages (REP 117) at the limits of each field."""
 
 from __future__ import annotations
 
@@ -23,37 +23,37 @@ from forward_grid_mapper.core.messages.rep117 import (
 PLAIN = RangeMessage(7, 'sonar', 1.0, 0.1, 4.0, 0.3)
 
 
-def said(message: RangeMessage, **values: object) -> Measurement:
+def measured(message: RangeMessage, **values: object) -> Measurement:
     made = measure(message, Parameters.from_flat(values).association)
     assert isinstance(made, Measurement), made
     return made
 
 
-def refused(message: RangeMessage, **values: object) -> str:
+def rejected_as(message: RangeMessage, **values: object) -> str:
     made = measure(message, Parameters.from_flat(values).association)
     assert isinstance(made, str)
     return made
 
 
-def test_reasons_that_took_many_readings_are_worth_a_warning() -> None:
+def test_warning_names_reasons_that_rejected_many_readings() -> None:
     rejected = {'below_min_range': 21, 'nan_range': 20, 'unknown_extrinsics': 50}
-    (told,) = rejection_warnings(rejected, 100, 'ranges', known={'unknown_extrinsics'})
-    assert told.startswith('21 of 100 ranges were rejected as below_min_range') and 'send +inf' in told
+    (warning,) = rejection_warnings(rejected, 100, 'ranges', known={'unknown_extrinsics'})
+    assert warning.startswith('21 of 100 ranges were rejected as below_min_range') and 'send +inf' in warning
 
 
-def test_a_sensor_that_loses_nearly_all_readings_is_named_however_few_they_are() -> None:
+def test_warning_names_a_sensor_with_nearly_all_readings_rejected() -> None:
     fine = {f'sonar_{k}': (100, 20) for k in range(20)}
     by_frame = {'left': {'too_near': 95, 'nan_range': 3}, 'sonar_3': {'too_near': 50}, 'right': {'nan_range': 29}}
-    (told,) = sensor_rejections(by_frame, {**fine, 'left': (2, 0)})
-    assert told.startswith('nearly all readings of left were rejected as too_near: ') and 'sensor is dead' in told
+    (warning,) = sensor_rejections(by_frame, {**fine, 'left': (2, 0)})
+    assert warning.startswith('nearly all readings of left were rejected as too_near: ') and 'sensor is dead' in warning
     assert sensor_rejections(by_frame, {**fine, 'left': (20, 0)}) == []
     assert sensor_rejections(by_frame, fine, known={'too_near'}) == []
-    # a frame without a name is told of by its reason, and so is what costs many of all readings
+    # no warning for a frame without name, which has its own reason, nor for a reason that rejected many of all readings
     assert sensor_rejections({'': {'empty_frame_id': 50}}, fine) == []
     assert sensor_rejections({'left': {'too_near': 600}}, fine) == []
-    # nor is a sensor dead that hears nothing, where that is to be discarded
+    # no warning for a sensor without echoes, if these are discarded on purpose
     assert sensor_rejections({'left': {'over_range': 95}, 'right': {'paused': 50}}, fine) == []
-    # what is wrong with all sensors is told by other warnings
+    # a fault of all sensors has other warnings
     assert sensor_rejections({'left': {'too_near': 95}}, {'left': (2, 0)}) == []
     assert sensor_rejections({'left': {'too_near': 95}}, {}) == []
     without_stamps = {'zero_stamp': 900}
@@ -61,69 +61,69 @@ def test_a_sensor_that_loses_nearly_all_readings_is_named_however_few_they_are()
     assert len(sensor_rejections({'left': {'too_near': 95}, 'right': without_stamps}, {'rear': (2, 0)})) == 1
 
 
-def test_reasons_of_poses_are_reasons() -> None:
+def test_reasons_of_poses_are_known_reasons() -> None:
     assert OF_POSES | CHOSEN < set(REASONS)
 
 
-def test_many_such_sensors_are_not_all_named() -> None:
+def test_warning_names_eight_sensors_at_most() -> None:
     by_frame = {f'sonar_{k:02d}': {'bad_limits': 30} for k in reversed(range(12))}
-    (told,) = sensor_rejections(by_frame, {'left': (3000, 0)})
-    assert 'sonar_07 and 4 more were rejected as bad_limits' in told and 'sonar_08' not in told
+    (warning,) = sensor_rejections(by_frame, {'left': (3000, 0)})
+    assert 'sonar_07 and 4 more were rejected as bad_limits' in warning and 'sonar_08' not in warning
 
 
-def test_what_a_plain_message_says() -> None:
-    made = said(PLAIN)
+def test_measurement_of_a_plain_message() -> None:
+    made = measured(PLAIN)
     assert (made.stamp, made.frame_id, made.z, made.z_max) == (7, 'sonar', 1.0, 4.0)
     assert (made.half_angle, made.sigma) == (0.15, 0.0)
     assert (made.number, made.arrival, made.newest) == (0, 0.0, None)
 
 
 @pytest.mark.parametrize('variance', [0.0, -1.0, -0.5, math.inf, math.nan])
-def test_a_variance_that_states_nothing(variance: float) -> None:
-    assert said(PLAIN._replace(variance=variance)).sigma == 0.0
+def test_variance_of_zero_or_without_meaning_is_ignored(variance: float) -> None:
+    assert measured(PLAIN._replace(variance=variance)).sigma == 0.0
 
 
-def test_a_variance_is_the_square_of_sigma() -> None:
-    assert said(PLAIN._replace(variance=0.25)).sigma == 0.5
+def test_variance_is_the_square_of_sigma() -> None:
+    assert measured(PLAIN._replace(variance=0.25)).sigma == 0.5
 
 
-def test_names_up_to_255_characters() -> None:
+def test_frame_id_of_255_characters_is_accepted_and_longer_is_not() -> None:
     assert LONGEST_NAME == 255
-    assert said(PLAIN._replace(frame_id='x' * 255)).frame_id == 'x' * 255
-    assert refused(PLAIN._replace(frame_id='x' * 256)) == 'long_frame_id'
+    assert measured(PLAIN._replace(frame_id='x' * 255)).frame_id == 'x' * 255
+    assert rejected_as(PLAIN._replace(frame_id='x' * 256)) == 'long_frame_id'
 
 
-def test_a_fixed_distance_ranger() -> None:
-    """-inf is something within max_range, 0 and below is nothing that it says, and +inf is no echo."""
+def test_fixed_distance_ranger() -> None:
+    """-inf is an object within max_range, 0 and below are invalid, and +inf is no echo."""
     fixed = PLAIN._replace(min_range=3.0, max_range=3.0)
-    something = said(fixed._replace(range=-math.inf, variance=0.01))
+    something = measured(fixed._replace(range=-math.inf, variance=0.01))
     assert (something.z, something.sigma) == (1.5, 0.25)
-    assert refused(fixed._replace(range=-0.5)) == 'below_min_range'
-    assert refused(fixed._replace(range=0.0)) == 'too_near'
-    assert said(fixed._replace(range=math.inf)).z == 3.0
+    assert rejected_as(fixed._replace(range=-0.5)) == 'below_min_range'
+    assert rejected_as(fixed._replace(range=0.0)) == 'too_near'
+    assert measured(fixed._replace(range=math.inf)).z == 3.0
 
 
 @pytest.mark.parametrize('value', [math.nan, 0.0, -0.0, -1.0, NEAREST / 2])
-def test_invalid_ranges_may_mean_no_echo(value: float) -> None:
+def test_invalid_range_can_be_set_to_mean_no_echo(value: float) -> None:
     silent = PLAIN._replace(range=value)
-    refused(silent)
-    assert said(silent, invalid_range='no_echo').z == PLAIN.max_range
-    assert refused(silent, invalid_range='no_echo', over_range='discard') == 'over_range'
+    rejected_as(silent)
+    assert measured(silent, invalid_range='no_echo').z == PLAIN.max_range
+    assert rejected_as(silent, invalid_range='no_echo', over_range='discard') == 'over_range'
 
 
-def test_what_is_too_near_is_never_no_echo() -> None:
-    assert refused(PLAIN._replace(range=-math.inf), invalid_range='no_echo') == 'too_near'
-    assert refused(PLAIN._replace(range=NEAREST), invalid_range='no_echo') == 'below_min_range'
+def test_range_that_is_too_near_never_means_no_echo() -> None:
+    assert rejected_as(PLAIN._replace(range=-math.inf), invalid_range='no_echo') == 'too_near'
+    assert rejected_as(PLAIN._replace(range=NEAREST), invalid_range='no_echo') == 'below_min_range'
     fixed = PLAIN._replace(min_range=3.0, max_range=3.0, range=-math.inf)
-    assert said(fixed, invalid_range='no_echo').z == 1.5
+    assert measured(fixed, invalid_range='no_echo').z == 1.5
 
 
-def test_the_least_and_the_largest_range() -> None:
-    assert said(PLAIN._replace(range=NEAREST, min_range=0.0)).z == NEAREST
-    assert said(PLAIN._replace(range=0.1)).z == 0.1
-    assert said(PLAIN._replace(range=4.0), over_range='no_echo').z == 4.0
-    assert refused(PLAIN._replace(range=4.0), over_range='discard') == 'over_range'
-    assert said(PLAIN._replace(range=3.999), over_range='discard').z == 3.999
+def test_smallest_and_largest_range_are_accepted() -> None:
+    assert measured(PLAIN._replace(range=NEAREST, min_range=0.0)).z == NEAREST
+    assert measured(PLAIN._replace(range=0.1)).z == 0.1
+    assert measured(PLAIN._replace(range=4.0), over_range='no_echo').z == 4.0
+    assert rejected_as(PLAIN._replace(range=4.0), over_range='discard') == 'over_range'
+    assert measured(PLAIN._replace(range=3.999), over_range='discard').z == 3.999
 
 
 @pytest.mark.parametrize(
@@ -139,26 +139,26 @@ def test_the_least_and_the_largest_range() -> None:
         {'min_range': math.inf, 'max_range': math.inf},
     ],
 )
-def test_limits_that_make_no_sense(changes: dict[str, float]) -> None:
-    assert refused(PLAIN._replace(**changes)) == 'bad_limits'
+def test_senseless_limits_are_rejected(changes: dict[str, float]) -> None:
+    assert rejected_as(PLAIN._replace(**changes)) == 'bad_limits'
 
 
-def test_a_largest_range_given_by_parameter_at_the_least_one() -> None:
-    assert refused(PLAIN._replace(min_range=2.0), max_range=2.0) == 'bad_limits'
-    assert said(PLAIN._replace(min_range=2.0, range=2.5), max_range=2.6).z_max == 2.6
+def test_max_range_by_parameter_must_be_above_min_range() -> None:
+    assert rejected_as(PLAIN._replace(min_range=2.0), max_range=2.0) == 'bad_limits'
+    assert measured(PLAIN._replace(min_range=2.0, range=2.5), max_range=2.6).z_max == 2.6
 
 
-def test_a_largest_range_of_a_millimetre_is_one() -> None:
-    assert said(PLAIN._replace(min_range=0.0, max_range=NEAREST)).z_max == NEAREST
+def test_max_range_of_a_millimetre_is_accepted() -> None:
+    assert measured(PLAIN._replace(min_range=0.0, max_range=NEAREST)).z_max == NEAREST
 
 
 @pytest.mark.parametrize('angle', [math.pi, 0.0, -0.1])
-def test_cones_of_no_angle_or_half_of_the_plane(angle: float) -> None:
-    assert refused(PLAIN._replace(field_of_view=angle)) == 'bad_field_of_view'
-    assert said(PLAIN._replace(field_of_view=math.nextafter(math.pi, 0))).half_angle < math.pi / 2
+def test_field_of_view_of_zero_or_180_degrees_is_rejected(angle: float) -> None:
+    assert rejected_as(PLAIN._replace(field_of_view=angle)) == 'bad_field_of_view'
+    assert measured(PLAIN._replace(field_of_view=math.nextafter(math.pi, 0))).half_angle < math.pi / 2
 
 
-def test_the_order_is_that_of_stamps_and_then_of_arrival() -> None:
-    first, second, later = said(PLAIN), said(PLAIN), said(PLAIN._replace(stamp=8))
+def test_measurements_are_ordered_by_stamp_and_then_by_arrival() -> None:
+    first, second, later = measured(PLAIN), measured(PLAIN), measured(PLAIN._replace(stamp=8))
     second.number = 1
-    assert first < second < later and not second < first and not first < said(PLAIN)
+    assert first < second < later and not second < first and not first < measured(PLAIN)

@@ -49,7 +49,7 @@ def _kept(topics: Sequence[str]) -> str:
 
 @pytest.mark.parametrize('at_once', [False, True])
 @pytest.mark.parametrize('turned', [False, True])
-def test_a_filtered_copy_is_named_with_the_topics_to_keep(at_once: bool, turned: bool) -> None:
+def test_filtered_copy_is_named_with_the_topics_to_keep(at_once: bool, turned: bool) -> None:
     topics: Topics = {
         '/sonar/front': of('front', RAW.__getitem__),
         '/sonar/front_filtered': of('front', FILTERED.__getitem__),
@@ -65,7 +65,7 @@ def test_a_filtered_copy_is_named_with_the_topics_to_keep(at_once: bool, turned:
     assert text.endswith(f'is /sonar/front_filtered a filtered copy? keep {kept}')
 
 
-def test_an_array_and_its_copy_are_named_once() -> None:
+def test_array_and_its_copy_are_named_once() -> None:
     frames = [f'sonar_{n}' for n in range(6)]
     ranges = [message for n, frame in enumerate(frames) for message in of(frame, measured(n).__getitem__)]
     (text,) = notes({'/relay': ranges, '/a/long/name/of/sonars': ranges})
@@ -101,7 +101,7 @@ def test_messages_without_a_stamp_are_not_compared() -> None:
 
 
 @pytest.mark.parametrize('at_once', [False, True])
-def test_it_compares_a_bounded_number_of_messages(monkeypatch: pytest.MonkeyPatch, at_once: bool) -> None:
+def test_number_of_compared_messages_is_bounded(monkeypatch: pytest.MonkeyPatch, at_once: bool) -> None:
     monkeypatch.setattr(repeated_topics, 'MOST', 2 * ENOUGH)
     copies = {'/one': of('sonar', RAW.__getitem__), '/other': of('sonar', RAW.__getitem__)}
     assert notes(copies, at_once) == []

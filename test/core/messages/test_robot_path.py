@@ -1,4 +1,4 @@
-"""The path that pictures show."""
+"""The path of the robot that pictures show."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import numpy as np
 from forward_grid_mapper.core.messages.robot_path import MOST_POINTS, STEP, RobotPath
 
 
-def test_a_long_path_has_fewer_points() -> None:
+def test_points_of_a_long_path_are_bounded_and_even() -> None:
     path = RobotPath()
     for k in range(3 * MOST_POINTS):
         path.extend((0.06 * k, 0.0))
@@ -17,7 +17,7 @@ def test_a_long_path_has_fewer_points() -> None:
     assert steps.max() < 2.5 * np.median(steps)
 
 
-def test_points_are_a_step_apart_again_after_clearing() -> None:
+def test_points_are_one_step_apart_after_clearing() -> None:
     path = RobotPath()
     for k in range(MOST_POINTS + 1):
         path.extend((0.06 * k, 0.0))
@@ -27,7 +27,7 @@ def test_points_are_a_step_apart_again_after_clearing() -> None:
     assert path.points == [(0.0, 0.0), (1.1 * STEP, 0.0)]
 
 
-def test_every_other_point_goes_when_there_are_too_many() -> None:
+def test_every_second_point_is_removed_above_the_limit() -> None:
     path = RobotPath()
     for k in range(MOST_POINTS):
         path.extend((1.0 * k, 2.0))
@@ -40,7 +40,7 @@ def test_every_other_point_goes_when_there_are_too_many() -> None:
     assert path.points[-2:] == [(last, 2.0), (last + 2.1 * STEP, 2.0)], 'the step is twice as long'
 
 
-def test_a_point_is_farther_than_a_step_from_the_last() -> None:
+def test_points_nearer_than_a_step_are_skipped() -> None:
     path = RobotPath()
     for point in ((0.0, 0.0), (STEP, 0.0), (0.8 * STEP, 0.8 * STEP), (0.8 * STEP, 0.1 * STEP), (0.8 * STEP, -STEP)):
         path.extend(point)

@@ -1,4 +1,4 @@
-"""What a stamp of odometry says of those before it."""
+"""Classification of odometry stamps: continued, jumped back, or an earlier one was ahead."""
 
 from __future__ import annotations
 
@@ -31,12 +31,12 @@ FAR = 10 * JUMP
         ([5, 7, 6, FAR, 6], JUMPED_BACK),
     ],
 )
-def test_order(stamps: list[int], last: str) -> None:
+def test_last_stamp_is_classified_by_those_before(stamps: list[int], last: str) -> None:
     order = StampOrder()
     assert [order.take(stamp) for stamp in stamps][-1] == last
 
 
-def test_it_is_that_of_the_associator() -> None:
+def test_associator_counts_jumps_as_stamp_order_does() -> None:
     rng = random.Random(3)
     for _ in range(50):
         order, associator = StampOrder(), PoseAssociator(lambda base, frame, stamp: None)

@@ -1,4 +1,4 @@
-"""What stays of too many readings: the newest of those that repeat each other, however they came."""
+"""Thinning of readings: of repeated readings the newest are kept, in any order of arrival."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def made(rng: np.random.Generator, count: int, places: int = 5) -> Readings:
 
 
 def rows(readings: Readings) -> list[tuple[object, ...]]:
-    """The readings as a set would see them."""
+    """The readings in canonical order."""
     names = np.array(readings.sensor_names or ('',))[readings.sensor]
     columns = (readings.x, readings.y, readings.yaw, readings.z, readings.stamp, names)
     return sorted(zip(*(column.tolist() for column in columns), strict=True))
@@ -54,7 +54,9 @@ def appended(readings: Readings, bound: int, order: np.ndarray) -> ReadingBuffer
 
 @settings(deadline=None, max_examples=60)
 @given(st.integers(0, 2**32 - 1), st.integers(1, 300), st.integers(1, 120), st.integers(1, 40))
-def test_the_order_and_the_moments_of_thinning_do_not_matter(seed: int, count: int, bound: int, places: int) -> None:
+def test_kept_readings_do_not_depend_on_order_or_time_of_thinning(
+    seed: int, count: int, bound: int, places: int
+) -> None:
     rng = np.random.default_rng(seed)
     readings = made(rng, count, places)
     expected = rows(readings.select(kept(readings, bound)))
@@ -66,7 +68,7 @@ def test_the_order_and_the_moments_of_thinning_do_not_matter(seed: int, count: i
         assert rows(buffer.bounded()) == expected
 
 
-def test_a_robot_that_stands_still_gives_up_only_what_repeats_itself() -> None:
+def test_standstill_removes_only_repeated_readings() -> None:
     drive = corridor_drive(0).readings
     rng = np.random.default_rng(1)
     still = dataclasses.replace(
@@ -78,11 +80,11 @@ def test_a_robot_that_stands_still_gives_up_only_what_repeats_itself() -> None:
     left = buffer.bounded()
     assert len(left) == len(drive) + 500
     moved = left.stamp <= drive.stamp.max()
-    # what the drive itself says twice goes too, but every bin that it has stays
+    # repeated readings of the drive itself are removed as well, but each bin keeps one
     assert np.count_nonzero(moved) > 0.9 * len(drive)
 
 
-def test_a_quarter_of_the_readings_gives_the_same_map() -> None:
+def test_quarter_of_the_readings_gives_about_the_same_map() -> None:
     drive = corridor_drive(0, passes=2)
     visible = visible_surface(drive.world, drive.readings.select(slice(None, None, 40)))
     few = drive.readings.select(kept(drive.readings, len(drive.readings) // 4))
@@ -94,7 +96,7 @@ def test_a_quarter_of_the_readings_gives_the_same_map() -> None:
     assert scores[1].f1 > scores[0].f1 - 0.05
 
 
-def test_every_reading_is_looked_at_before_it_is_thinned() -> None:
+def test_each_reading_is_seen_before_thinning() -> None:
     rng = np.random.default_rng(3)
     readings = made(rng, 1000)
     buffer = ReadingBuffer(64)
@@ -110,7 +112,7 @@ def test_every_reading_is_looked_at_before_it_is_thinned() -> None:
     assert sorted(row for part in seen for row in rows(part)) == rows(readings)
 
 
-def test_what_cannot_be_thinned_for_want_of_memory_is_thinned_later() -> None:
+def test_thinning_without_memory_is_done_later() -> None:
     readings = made(np.random.default_rng(3), 1000)
     buffer, waiting = ReadingBuffer(64), list[Callable[[], None]]()
     buffer.aside = lambda thin, done: waiting.append(lambda: done(thin()))
@@ -131,7 +133,7 @@ def test_what_cannot_be_thinned_for_want_of_memory_is_thinned_later() -> None:
     assert buffer.held <= 64 and len(buffer) == 200
 
 
-def test_snapshots_from_another_thread_hold_together() -> None:
+def test_snapshots_from_another_thread_are_consistent() -> None:
     buffer = ReadingBuffer(500)
     done = threading.Event()
     wrong: list[str] = []

@@ -1,4 +1,4 @@
-"""Where compiled kernels are kept, down to installs and homes that cannot be written."""
+"""The folder of compiled kernels, also for read-only installations and home folders."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ fixed_point.quantise_logs(room, 1, out)
 assert out[0] == 0
 print(compiling.count(), jit.CACHE, fixed_point.__file__)
 """
-"""Calls one kernel, a small one: where it is kept is where all are."""
+"""Calls one small kernel; all kernels are kept in the same folder."""
 
 
 def run(install: Path, temporary: Path) -> tuple[int, Path]:
@@ -46,8 +46,8 @@ def install(tmp_path: Path) -> Path:
     return folder
 
 
-def test_a_read_only_install_and_home_keep_kernels_in_a_temporary_folder(install: Path, tmp_path: Path) -> None:
-    # a file in the folder's place keeps even root from making it
+def test_read_only_install_and_home_use_a_temporary_folder(install: Path, tmp_path: Path) -> None:
+    # a file with the name of the folder: even root cannot make the folder
     (install / PACKAGE.name / 'core' / '__pycache__').write_text('')
     temporary = tmp_path / 'temporary'
     temporary.mkdir()
@@ -57,7 +57,7 @@ def test_a_read_only_install_and_home_keep_kernels_in_a_temporary_folder(install
     assert first > 0 and again == 0
 
 
-def test_kernels_lie_beside_the_sources_and_are_renewed_with_any_of_them(install: Path) -> None:
+def test_kernels_are_beside_the_sources_and_renewed_on_any_change(install: Path) -> None:
     temporary = Path(tempfile.gettempdir())
     _, before = run(install, temporary)
     assert before.parent == install / PACKAGE.name / 'core' / '__pycache__'
@@ -67,7 +67,7 @@ def test_kernels_lie_beside_the_sources_and_are_renewed_with_any_of_them(install
     assert after != before
 
 
-def test_kernels_of_other_sources_go_when_unused_for_a_day(install: Path) -> None:
+def test_kernels_of_other_sources_are_deleted_after_a_day(install: Path) -> None:
     beside = install / PACKAGE.name / 'core' / '__pycache__'
     old, recent = beside / 'kernels_old', beside / 'kernels_recent'
     for folder in (old, recent):

@@ -1,4 +1,4 @@
-"""Whether EM fits the memory, before it begins."""
+"""The check before EM whether there is enough memory."""
 
 from __future__ import annotations
 
@@ -19,14 +19,14 @@ from forward_grid_mapper.simulation.sonar import NOISY
 @pytest.mark.slow
 @pytest.mark.parametrize('threads', [1, 2, 16])
 @pytest.mark.parametrize('resolution', [0.1, 0.02])
-def test_what_a_run_takes_is_what_it_is_said_to_take(
+def test_memory_of_a_run_is_between_half_and_all_of_the_estimate(
     monkeypatch: pytest.MonkeyPatch, threads: int, resolution: float
 ) -> None:
     monkeypatch.setattr(runtime_threads, 'LEAST_PART', 100)
     readings = (corridor_drive(0) if resolution == 0.1 else door_drive(3, NOISY)).readings
     parameters = Parameters.from_flat({'threads': threads, 'max_memory': 0, 'resolution': resolution})
     assert len(runtime_threads.parts(0, len(readings), threads)) == min(threads, len(readings) // 100)
-    # first, so that compiling is not counted
+    # first, so that compilation is not counted
     Mapper(parameters).run(readings.select(slice(0, 500)))
     tracemalloc.start()
     try:
@@ -34,16 +34,16 @@ def test_what_a_run_takes_is_what_it_is_said_to_take(
         taken = tracemalloc.get_traced_memory()[1]
     finally:
         tracemalloc.stop()
-    told = least_memory(maps.grid.size, len(readings), threads)
-    assert told / 2 < taken < told
+    estimated = least_memory(maps.grid.size, len(readings), threads)
+    assert estimated / 2 < taken < estimated
 
 
-def test_another_thread_takes_no_more_on_a_large_map() -> None:
+def test_memory_of_threads_is_bounded_on_large_maps() -> None:
     assert least_memory(10**7, 0, 64) == least_memory(10**7, 0, 2) <= 10**7 * BYTES_A_CELL + THREAD_MEMORY
     assert least_memory(1000, 0, 3) - least_memory(1000, 0, 1) == 2 * 1000 * 32
 
 
-def test_what_is_free_is_known_and_bounded_by_the_group(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def test_free_memory_is_bounded_by_the_control_group(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     free = free_memory()
     assert free is not None
     assert free > 10**6
@@ -58,7 +58,7 @@ def test_what_is_free_is_known_and_bounded_by_the_group(monkeypatch: pytest.Monk
 
 
 @pytest.mark.parametrize('version', [1, 2])
-def test_the_group_of_a_service_is_its_own_and_what_files_were_read_is_no_use(
+def test_free_memory_in_a_group_includes_the_page_cache(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path, version: int
 ) -> None:
     limit, use, cached = (
@@ -81,7 +81,7 @@ def test_the_group_of_a_service_is_its_own_and_what_files_were_read_is_no_use(
     assert free_memory() == 1_000_000
     (group / 'memory.stat').write_text(f'anon 1\n{cached} 6000000\n')
     assert free_memory() == 7_000_000
-    # that of the slice, which it is in, counts as well
+    # the limit of the parent slice counts as well
     (group.parent / limit).write_text('9000000\n')
     (group.parent / use).write_text('8500000\n')
     assert free_memory() == 500_000

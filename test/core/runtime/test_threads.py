@@ -1,4 +1,4 @@
-"""Work shared out to threads; that their number and the memory change no result is told of the search as a whole."""
+"""Work on several threads; the results of the search do not depend on their number or on memory."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ AREA = Grid(0.1, -13, 4, 60, 50)
 
 
 @given(st.integers(0, 10**7), st.integers(0, 10**7), st.integers(1, 300))
-def test_parts_are_the_whole_range_in_order_and_none_is_small(begin: int, size: int, workers: int) -> None:
+def test_parts_cover_the_range_in_order_and_none_is_small(begin: int, size: int, workers: int) -> None:
     parts = threads.parts(begin, begin + size, workers)
     assert parts[0][0] == begin
     assert parts[-1][1] == begin + size
@@ -33,7 +33,7 @@ def test_parts_are_the_whole_range_in_order_and_none_is_small(begin: int, size: 
     assert len(parts) == min(workers, max(size // threads.LEAST_PART, 1))
 
 
-def test_work_runs_at_the_same_time_and_is_waited_for() -> None:
+def test_run_each_runs_work_in_parallel_and_waits() -> None:
     meeting, done = threading.Barrier(3, timeout=20), []
 
     def work(k: int) -> None:
@@ -44,14 +44,14 @@ def test_work_runs_at_the_same_time_and_is_waited_for() -> None:
     assert sorted(done) == [0, 1, 2]
 
 
-def test_one_piece_of_work_needs_no_thread() -> None:
+def test_single_work_runs_in_the_calling_thread() -> None:
     seen: list[int] = []
     threads.run_each([lambda: seen.append(threading.get_ident())])
     assert seen == [threading.get_ident()]
 
 
 @pytest.mark.parametrize('count', [1, 3])
-def test_an_error_of_a_thread_is_raised(count: int) -> None:
+def test_error_of_a_thread_is_raised(count: int) -> None:
     def work() -> None:
         raise ValueError('of the work')
 
@@ -59,7 +59,7 @@ def test_an_error_of_a_thread_is_raised(count: int) -> None:
         threads.run_each([work] * count)
 
 
-def test_there_is_a_core() -> None:
+def test_number_of_cores_is_at_least_one() -> None:
     assert threads.cores() >= 1
 
 
@@ -75,7 +75,7 @@ def search(workers: int, memory: float, seed: int, plain: bool) -> tuple[SearchR
 
 
 @pytest.mark.parametrize(('seed', 'plain'), [(0, True), (1, False)], ids=['plain', 'whole'])
-def test_neither_threads_nor_memory_change_a_bit_of_the_search(
+def test_search_result_does_not_depend_on_threads_or_memory(
     monkeypatch: pytest.MonkeyPatch, seed: int, plain: bool
 ) -> None:
     first, evidence = search(1, np.inf, seed, plain)
@@ -93,7 +93,7 @@ def test_neither_threads_nor_memory_change_a_bit_of_the_search(
         assert less.log_likelihood == evidence.log_likelihood
 
 
-def test_the_maps_do_not_depend_on_threads_or_memory(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_maps_do_not_depend_on_threads_or_memory(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(threads, 'LEAST_PART', 50)
     readings = random_readings(np.random.default_rng(5), AREA, 1500, z_max=3.0)
     made = [

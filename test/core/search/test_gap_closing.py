@@ -1,4 +1,4 @@
-"""Moves of whole walls: gaps close at once, doors stay open, and short walls vanish at once."""
+"""Moves of whole walls: gaps are closed in one move, doors stay open, and short walls are removed in one move."""
 
 from __future__ import annotations
 
@@ -31,11 +31,11 @@ GRID = Grid(0.1, 0, 0, 24, 14)
 MODEL = plain_model(p_hit=0.7, p_rand=0.4, p_lost=0.4, sigma=0.05)
 WALL = 8
 GAP = range(9, 13)
-FREE, LOOKED_THROUGH = 1, 12
+FEW_PASSED, MANY_PASSED = 1, 12
 
 
 def room(through: int, gap: range = GAP) -> Readings:
-    """Five echoes in each column from the wall in row 8, but in its gap `through` readings that heard nothing."""
+    """Five echoes in each column of the wall in row 8; in those of its gap, `through` readings without echo."""
     columns = [c for c in range(2, 22) for _ in range(through if c in gap else 5)]
     echo = np.array([c not in gap for c in columns])
     return Readings.from_columns(
@@ -70,8 +70,8 @@ def closed(evidence: Evidence, prior: Prior, longest: int) -> tuple[int, float]:
     return close_gaps(evidence.state, prior, LEAST, cells, longest)
 
 
-def test_a_gap_that_few_looked_through_is_closed_and_only_at_once(searched) -> None:
-    readings = room(FREE)
+def test_gap_passed_by_few_readings_is_closed_only_as_a_whole(searched) -> None:
+    readings = room(FEW_PASSED)
     open_, shut = (searched(readings, longest) for longest in (1, 10))
     assert not open_[:, list(GAP)].any()
     assert shut[WALL, list(GAP)].all()
@@ -79,22 +79,22 @@ def test_a_gap_that_few_looked_through_is_closed_and_only_at_once(searched) -> N
     assert shut.sum() == open_.sum() + len(GAP)
 
 
-def test_a_gap_wider_than_asked_for_stays(searched) -> None:
-    assert not searched(room(FREE), len(GAP))[:, list(GAP)].any()
-    assert searched(room(FREE), len(GAP) + 1)[WALL, list(GAP)].all()
+def test_gap_longer_than_the_limit_stays_open(searched) -> None:
+    assert not searched(room(FEW_PASSED), len(GAP))[:, list(GAP)].any()
+    assert searched(room(FEW_PASSED), len(GAP) + 1)[WALL, list(GAP)].all()
 
 
-def test_a_door_stays_open(searched) -> None:
-    assert not searched(room(LOOKED_THROUGH), 20, end_cost=50.0)[:, list(GAP)].any()
+def test_gap_passed_by_many_readings_stays_open(searched) -> None:
+    assert not searched(room(MANY_PASSED), 20, end_cost=50.0)[:, list(GAP)].any()
 
 
-def test_a_gap_that_nobody_saw_stays(searched) -> None:
+def test_gap_that_no_reading_saw_stays_open(searched) -> None:
     assert not searched(room(0), 20, end_cost=50.0)[:, list(GAP)].any()
 
 
-def test_a_closed_gap_that_does_not_gain_is_opened_again() -> None:
+def test_closing_a_gap_without_gain_is_undone() -> None:
     evidence = Evidence(GRID, MODEL)
-    evidence.extend(room(FREE))
+    evidence.extend(room(FEW_PASSED))
     start = np.zeros(GRID.shape, np.uint8)
     start[WALL, [c for c in range(2, 22) if c not in GAP]] = 1
     evidence.state.maps.occupied[:] = start.ravel()
@@ -108,8 +108,8 @@ def test_a_closed_gap_that_does_not_gain_is_opened_again() -> None:
 
 
 @pytest.mark.parametrize('step', [(0, 1), (1, 1), (1, 0), (1, -1), (1, 2), (3, 1)])
-def test_gaps_lead_in_any_direction(step: tuple[int, int]) -> None:
-    # two pieces of a straight wall; nothing is said of the cells between but that they were seen
+def test_gaps_are_closed_in_any_direction(step: tuple[int, int]) -> None:
+    # two pieces of a straight wall; of the cells between, readings say only that they were seen
     evidence = Evidence(GRID, MODEL)
     occupied = np.zeros(GRID.shape, np.uint8)
     reach = np.array([n for n in range(-30, 31) if abs(n) >= 6]) / (3 * max(step))
@@ -127,7 +127,7 @@ def test_gaps_lead_in_any_direction(step: tuple[int, int]) -> None:
 
 
 @pytest.mark.parametrize('seed', range(20))
-def test_what_closed_gaps_gain_is_reported_and_they_lie_where_they_may(seed: int) -> None:
+def test_gain_of_closed_gaps_is_exact_and_only_allowed_cells_are_closed(seed: int) -> None:
     rng = np.random.default_rng(seed)
     readings = random_readings(rng, GRID, 12, z_max=1.5)
     start = rng.random(GRID.shape) < 0.08
@@ -140,7 +140,7 @@ def test_what_closed_gaps_gain_is_reported_and_they_lie_where_they_may(seed: int
         shaped = maps.occupied.reshape(GRID.shape)
         return log_likelihood(readings, GRID, shaped, MODEL) + naive.log_prior(prior, shaped, GRID.shape)
 
-    before, told = height(), maps.evidence * QUANTUM
+    before, actual = height(), maps.evidence * QUANTUM
     flips, gain = closed(evidence, prior, 6)
     assert height() - before == pytest.approx(gain, abs=1e-4)
     built = (maps.occupied == 1) & ~start.ravel()
@@ -149,7 +149,7 @@ def test_what_closed_gaps_gain_is_reported_and_they_lie_where_they_may(seed: int
     assert (maps.seen[built] > 0).all()
     assert np.array_equal(maps.pattern, patterns(maps.occupied, GRID.shape))
     if flips == 1:
-        assert told[built] >= -MOST_AGAINST_METRE * GRID.resolution
+        assert actual[built] >= -MOST_AGAINST_METRE * GRID.resolution
 
 
 @pytest.mark.parametrize(
@@ -162,12 +162,12 @@ def test_what_closed_gaps_gain_is_reported_and_they_lie_where_they_may(seed: int
         # 0.25 m
         (5, 0.49, 0.05, True),
         (5, 0.51, 0.05, False),
-        # 0.5 m, through which a robot may go
+        # 0.5 m, wide enough for a robot
         (5, 0.29, 0.1, True),
         (5, 0.31, 0.1, False),
     ],
 )
-def test_no_cell_may_have_much_against_it_nor_all_together(
+def test_gap_with_too_much_evidence_against_it_stays_open(
     gap: int, against: float, resolution: float, stands: bool
 ) -> None:
     assert (MOST_AGAINST_METRE, MOST_AGAINST_GAP, MOST_AGAINST_PASSAGE, PASSAGE) == (10.0, 4.0, 1.5, 0.35)
@@ -183,16 +183,16 @@ def test_no_cell_may_have_much_against_it_nor_all_together(
     assert (gain > 0) == stands
 
 
-def test_moves_stop_when_asked_to() -> None:
+def test_stop_flag_ends_the_moves() -> None:
     evidence = Evidence(GRID, MODEL)
-    evidence.extend(room(FREE))
+    evidence.extend(room(FEW_PASSED))
     evidence.state.stop[0] = 1
     assert close_gaps(evidence.state, prior_for(SearchParameters()), LEAST, np.arange(4), 9) == (0, 0.0)
     evidence.state.maps.occupied[:] = 1
     assert remove_short_walls(evidence.state, prior_for(SearchParameters()), LEAST, np.arange(4), 1000) == (0, 0.0)
 
 
-def test_a_gap_may_have_more_against_it_where_readings_count_less() -> None:
+def test_limit_of_evidence_against_a_gap_scales_with_the_exponent() -> None:
     for exponent, stands in ((1.0, False), (0.5, True)):
         evidence = Evidence(GRID, dataclasses.replace(MODEL, likelihood_exponent=exponent))
         maps = evidence.state.maps
@@ -213,7 +213,7 @@ def removed(evidence: Evidence, prior: Prior, longest: int) -> tuple[int, float]
 
 
 def components(occupied: np.ndarray) -> list[set[int]]:
-    """The twin: sets of connected cells, by union of neighbours until nothing changes."""
+    """Twin in plain Python: sets of connected cells, by union of neighbours until nothing changes."""
     left = [{int(c)} for c in np.flatnonzero(occupied.ravel())]
     joined = True
     while joined:
@@ -232,12 +232,12 @@ def components(occupied: np.ndarray) -> list[set[int]]:
 
 @pytest.mark.parametrize('seed', range(15))
 @pytest.mark.parametrize('longest', [1, 3, 6])
-def test_short_walls_are_removed_where_the_twin_has_it(seed: int, longest: int) -> None:
+def test_short_walls_are_removed_as_in_the_twin(seed: int, longest: int) -> None:
     rng = np.random.default_rng(seed)
     start = (rng.random(GRID.shape) < 0.18).astype(np.uint8)
     evidence = Evidence(GRID, MODEL, start=start)
     maps = evidence.state.maps
-    # no readings: what a wall gains is what is written here, cell by cell
+    # no readings: the gain of each cell is set here
     maps.evidence[:] = np.round(rng.uniform(-4.0, 0.5, GRID.size) / QUANTUM)
     maps.evidence[start.ravel() == 0] = 0
     prior = prior_for(SearchParameters(end_cost=1.5))
@@ -258,7 +258,7 @@ def test_short_walls_are_removed_where_the_twin_has_it(seed: int, longest: int) 
     assert np.array_equal(maps.pattern, patterns(maps.occupied, GRID.shape))
 
 
-def test_single_flips_leave_a_short_wall_that_its_removal_takes_away(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_short_wall_that_single_flips_keep_is_removed_as_a_whole(monkeypatch: pytest.MonkeyPatch) -> None:
     # one echo in each of three neighbouring columns: less than the two ends of a wall cost
     readings = Readings.from_columns(
         x=np.array([0.85, 0.95, 1.05]),

@@ -1,4 +1,4 @@
-"""Choosing and making moves, against plain twins and against evaluations of whole maps."""
+"""Choosing and making moves, compared with plain Python and with evaluations of whole maps."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ def random_case(
 ) -> tuple[Evidence, Readings]:
     rng = np.random.default_rng(seed)
     readings = (naive.awkward_readings, random_readings)[seed % 2](rng, GRID, count)
-    # off the lattice, so that it is not rounding that tells on which side of the cut a cell lies
+    # not on the lattice, so that rounding does not decide on which side of the cut a cell is
     readings.x[:] += 0.001234
     readings.y[:] -= 0.000777
     readings.z[:] = np.minimum(readings.z + 0.000345, readings.z_max)
@@ -62,7 +62,7 @@ def model_of(evidence: Evidence) -> ModelParameters:
 
 
 def prior_of(name: str) -> Prior:
-    """All in sixteenths of a nat, so that sums are exact in any order."""
+    """A prior in sixteenths of a nat, so that sums are exact in any order."""
     if name in ('none', 'less'):
         return Prior(np.full(GRID.size, {'none': 0.0, 'less': -0.5}[name]), np.zeros(256))
     rng = np.random.default_rng(256)
@@ -105,7 +105,7 @@ def neighbours(c: int) -> list[int]:
 
 @pytest.mark.parametrize('seed', range(10))
 @pytest.mark.parametrize('name', ['none', 'less', 'shapes'])
-def test_promising_cells_are_those_whose_flip_gains(seed: int, name: str) -> None:
+def test_promising_cells_are_those_with_a_gain(seed: int, name: str) -> None:
     prior = prior_of(name)
     evidence, _ = random_case(seed)
     least = (0.01, 0.002)
@@ -123,7 +123,7 @@ def test_promising_cells_are_those_whose_flip_gains(seed: int, name: str) -> Non
 
 @pytest.mark.parametrize('seed', range(5))
 @pytest.mark.parametrize('name', ['none', 'less', 'shapes'])
-def test_promising_cells_of_an_empty_map_are_found_however_little_they_gain(seed: int, name: str) -> None:
+def test_promising_cells_of_an_empty_map_are_found_at_any_threshold(seed: int, name: str) -> None:
     rng = np.random.default_rng(seed)
     prior = prior_of(name)
     evidence, _ = random_case(seed)
@@ -137,7 +137,7 @@ def test_promising_cells_of_an_empty_map_are_found_however_little_they_gain(seed
 
 
 @pytest.mark.parametrize('seed', range(20))
-def test_blocks_without_anything_are_told_from_others(seed: int) -> None:
+def test_any_above_finds_blocks_with_promising_or_occupied_cells(seed: int) -> None:
     rng = np.random.default_rng(seed)
     size, floor = 200, np.int64(rng.integers(-5, 5))
     evidence = rng.integers(floor - 6, floor + 2, size)
@@ -150,30 +150,28 @@ def test_blocks_without_anything_are_told_from_others(seed: int) -> None:
 
 @pytest.mark.parametrize('seed', range(10))
 @PRIORS
-def test_the_highest_are_those_that_no_neighbour_beats(seed: int, prior: Prior) -> None:
+def test_local_maxima_are_cells_with_no_better_neighbour(seed: int, prior: Prior) -> None:
     evidence, _ = random_case(seed)
     # make ties
     evidence.state.maps.evidence[:] = evidence.state.maps.evidence >> 23 << 23
     cells, gains = listed(evidence, prior, NOTHING)
     room = np.zeros(GRID.size)
-    told = cells[highest(evidence.state, cells, gains, room)].tolist()
+    actual = cells[highest(evidence.state, cells, gains, room)].tolist()
     assert not room.any()
     expected = []
     for c in cells:
         rivals = [(gain(evidence, prior, o), -o) for o in neighbours(c) if o in cells]
         if all((gain(evidence, prior, c), -c) > rival for rival in rivals):
             expected.append(int(c))
-    assert told == expected
-    assert len(told) > 0
-    assert not any(set(neighbours(c)) & set(told) for c in told), 'no two that are neighbours'
+    assert actual == expected
+    assert len(actual) > 0
+    assert not any(set(neighbours(c)) & set(actual) for c in actual), 'no two that are neighbours'
 
 
 @pytest.mark.parametrize('seed', range(10))
 @pytest.mark.parametrize('memory', [math.inf, 0.0])
 @PRIORS
-def test_flips_in_order_are_made_while_they_gain_and_what_they_gain_is_told(
-    seed: int, memory: float, prior: Prior
-) -> None:
+def test_flips_in_order_stop_without_gain_and_return_the_total_gain(seed: int, memory: float, prior: Prior) -> None:
     evidence, readings = random_case(seed, memory=memory)
     twin, _ = random_case(seed)
     cells, gains = listed(evidence, prior)
@@ -193,7 +191,7 @@ def test_flips_in_order_are_made_while_they_gain_and_what_they_gain_is_told(
 
 @settings(deadline=None)
 @given(seeds, st.sampled_from([0.0, 0.001, 0.1]))
-def test_occupied_cells_that_cost_nothing_to_free_are_freed_one_after_the_other(seed: int, tolerance: float) -> None:
+def test_unneeded_occupied_cells_are_freed_one_after_the_other(seed: int, tolerance: float) -> None:
     evidence, _ = random_case(seed, filled=0.4)
     twin, _ = random_case(seed, filled=0.4)
     prior, occupied = prior_of('none'), np.flatnonzero(evidence.state.maps.occupied)
@@ -218,7 +216,7 @@ def joints(evidence: Evidence, cells: np.ndarray, readings: np.ndarray | None = 
 
 
 def positions(evidence: Evidence, t: int, c: int, o: int) -> str:
-    """Where reading t has the two cells of a shift."""
+    """Position of the two cells of a shift in the cone of reading t."""
     free, band, _, _ = naive.pairs_of(evidence.state, t)
     places = ['free' if k in free else 'band' if k in band else 'off' for k in (c, o)]
     if places == ['band', 'band']:
@@ -227,7 +225,7 @@ def positions(evidence: Evidence, t: int, c: int, o: int) -> str:
 
 
 @pytest.mark.parametrize('filled', [0.02, 0.15, 0.6])
-def test_the_joint_gain_of_a_reading_is_the_difference_of_two_evaluations(filled: float) -> None:
+def test_joint_gain_of_a_reading_is_the_difference_of_two_evaluations(filled: float) -> None:
     tried: dict[str, int] = {}
     for seed in range(12):
         evidence, readings = random_case(seed, 12, filled=filled)
@@ -253,12 +251,12 @@ def test_the_joint_gain_of_a_reading_is_the_difference_of_two_evaluations(filled
                     if maps.occupied[o]:
                         continue
                     k = next(k for k, other in naive.neighbours_of(c, GRID.shape).items() if other == o)
-                    told = (int(single.get(c, 0)) + int(single.get(o, 0)) + int(joint[i, k])) * QUANTUM
-                    # both ratios are rounded, which counts for more the more unlikely the shift makes the reading
+                    actual = (int(single.get(c, 0)) + int(single.get(o, 0)) + int(joint[i, k])) * QUANTUM
+                    # both ratios are rounded, which matters more the less likely the shift makes the reading
                     exact = evaluate(c, o) - before
                     ratios = [math.exp(int(single.get(k, 0)) * QUANTUM) for k in (c, o)]
                     error = 2e-7 * (1 + (ratios[0] + ratios[1] / (1 - model_of(evidence).p_hit)) / math.exp(exact))
-                    assert told == pytest.approx(exact, abs=error), positions(evidence, t, c, o)
+                    assert actual == pytest.approx(exact, abs=error), positions(evidence, t, c, o)
                     place = positions(evidence, t, c, o)
                     tried[place] = tried.get(place, 0) + 1
     wanted = {'band band behind', 'band band before', 'free free', 'free band', 'band free', 'off off'}
@@ -269,7 +267,7 @@ def test_the_joint_gain_of_a_reading_is_the_difference_of_two_evaluations(filled
 @pytest.mark.parametrize('memory', [math.inf, 0.0])
 @pytest.mark.parametrize('seed', range(10))
 @PRIORS
-def test_the_best_shifts_are_those_that_brute_force_finds(seed: int, memory: float, prior: Prior) -> None:
+def test_best_shifts_are_those_found_by_brute_force(seed: int, memory: float, prior: Prior) -> None:
     evidence, readings = random_case(seed, memory=memory)
     maps = evidence.state.maps
     cells = np.flatnonzero((maps.occupied == 1) & (maps.seen > 0))
@@ -278,7 +276,7 @@ def test_the_best_shifts_are_those_that_brute_force_finds(seed: int, memory: flo
     assert np.array_equal(maps.occupied, kept)
     assert np.array_equal(maps.pattern, patterns(kept, GRID.shape))
     before = height(evidence, readings, prior)
-    for c, target, told in zip(cells.tolist(), targets.tolist(), gains.tolist(), strict=True):
+    for c, target, actual in zip(cells.tolist(), targets.tolist(), gains.tolist(), strict=True):
         exact = {}
         for o in neighbours(c):
             if not maps.occupied[o] and maps.seen[o]:
@@ -288,15 +286,15 @@ def test_the_best_shifts_are_those_that_brute_force_finds(seed: int, memory: flo
         best = max(exact.values(), default=-1.0)
         if target < 0:
             assert best < 1e-3
-            assert told == 0
+            assert actual == 0
         else:
-            assert exact[target] == pytest.approx(told, abs=1e-4)
+            assert exact[target] == pytest.approx(actual, abs=1e-4)
             assert exact[target] == pytest.approx(best, abs=1e-4)
     assert (targets >= 0).any()
 
 
 @pytest.mark.parametrize('seed', range(4))
-def test_a_reading_of_weight_three_says_of_shifts_what_three_readings_say(seed: int) -> None:
+def test_joint_gain_of_weight_three_equals_that_of_three_readings(seed: int) -> None:
     heavy, readings = random_case(seed)
     heavy.add_multiplicity(np.repeat(np.arange(len(readings)), 2))
     thrice = Evidence(GRID, model_of(heavy), start=heavy.state.maps.occupied.reshape(GRID.shape))
@@ -306,7 +304,7 @@ def test_a_reading_of_weight_three_says_of_shifts_what_three_readings_say(seed: 
 
 
 @pytest.mark.parametrize('seed', range(4))
-def test_what_readings_say_of_shifts_adds_up_and_needs_no_memory(seed: int) -> None:
+def test_joint_gains_of_parts_add_up_with_and_without_stored_pairs(seed: int) -> None:
     evidence, _ = random_case(seed)
     cells = np.flatnonzero(evidence.state.maps.occupied)
     whole = joints(evidence, cells)
@@ -318,7 +316,7 @@ def test_what_readings_say_of_shifts_adds_up_and_needs_no_memory(seed: int) -> N
 
 @pytest.mark.parametrize('seed', range(10))
 @PRIORS
-def test_shifts_are_made_while_they_gain_and_what_they_gain_is_told(seed: int, prior: Prior) -> None:
+def test_shifts_in_order_stop_without_gain_and_return_the_total_gain(seed: int, prior: Prior) -> None:
     evidence, readings = random_case(seed)
     maps = evidence.state.maps
     cells = np.flatnonzero((maps.occupied == 1) & (maps.seen > 0))
@@ -328,11 +326,11 @@ def test_shifts_are_made_while_they_gain_and_what_they_gain_is_told(seed: int, p
     old = maps.occupied.copy()
     moves, total = 0, 0.0
     for k in order:
-        made, told = shift_in_order(evidence.state, prior, LEAST, cells[[k]], targets[[k]])
+        made, actual = shift_in_order(evidence.state, prior, LEAST, cells[[k]], targets[[k]])
         after = height(evidence, readings, prior)
-        assert after - before == pytest.approx(told, abs=1e-4)
-        assert (told > 0) == (made == 1)
-        moves, total, before = moves + made, total + told, after
+        assert after - before == pytest.approx(actual, abs=1e-4)
+        assert (actual > 0) == (made == 1)
+        moves, total, before = moves + made, total + actual, after
     assert moves > 0
     assert maps.occupied.sum() == old.sum()
     assert before - start == pytest.approx(total, abs=1e-3)
@@ -343,7 +341,7 @@ def test_shifts_are_made_while_they_gain_and_what_they_gain_is_told(seed: int, p
     assert np.array_equal(twin.state.maps.evidence, maps.evidence)
 
 
-def test_shifts_of_what_has_gone_or_to_where_something_is_are_left_out() -> None:
+def test_shifts_from_free_cells_or_onto_occupied_cells_are_skipped() -> None:
     evidence, _ = random_case(1)
     occupied, free = (np.flatnonzero(evidence.state.maps.occupied == v) for v in (1, 0))
     before = evidence.state.maps.occupied.copy()
@@ -354,7 +352,7 @@ def test_shifts_of_what_has_gone_or_to_where_something_is_are_left_out() -> None
 
 @settings(max_examples=25, deadline=None)
 @given(seeds, st.lists(st.integers(0, GRID.size - 1), min_size=1, max_size=4), st.sampled_from([math.inf, 0.0]))
-def test_readings_that_see_a_flip_are_found_and_unsettle_all_their_cells(
+def test_readings_that_see_a_flip_are_found_and_their_cells_unsettled(
     seed: int, cells: list[int], memory: float
 ) -> None:
     evidence, readings = random_case(seed, 25, memory=memory)
@@ -369,11 +367,11 @@ def test_readings_that_see_a_flip_are_found_and_unsettle_all_their_cells(
     assert sees.tolist() == [int(bool(seen & set(cells))) for seen in seen_by]
     settled = np.ones(GRID.size, np.uint8)
     unsettle(evidence.state, since, settled)
-    stirred = set().union(*(seen for seen in seen_by if seen & set(cells)))
-    assert set(np.flatnonzero(settled == 0).tolist()) == stirred
+    unsettled = set().union(*(seen for seen in seen_by if seen & set(cells)))
+    assert set(np.flatnonzero(settled == 0).tolist()) == unsettled
 
 
-def test_stop_ends_every_loop() -> None:
+def test_stop_flag_ends_each_loop() -> None:
     evidence, _ = random_case(1)
     cells, gains = listed(evidence, prior_of('none'))
     occupied = np.flatnonzero(evidence.state.maps.occupied)

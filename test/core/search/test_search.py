@@ -1,4 +1,4 @@
-"""Flips, moves and the search against full evaluations and, on tiny maps, against every map there is."""
+"""Flips, moves and the search, compared with full evaluations and, for tiny maps, with all possible maps."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ def make(
 
 
 def independent(prior: float, grid: Grid = GRID) -> Prior:
-    """That of cells that know nothing of each other."""
+    """The prior of independent cells."""
     return Prior(np.full(grid.size, math.log(prior / (1 - prior))), np.zeros(256))
 
 
@@ -57,7 +57,7 @@ def objective(
 
 
 @pytest.mark.parametrize('p_hit', [0.05, 0.5, 0.9, 0.98])
-def test_every_gain_is_the_difference_of_two_evaluations(p_hit: float) -> None:
+def test_each_gain_is_the_difference_of_two_evaluations(p_hit: float) -> None:
     rng = np.random.default_rng(round(p_hit * 100))
     model = plain_model(p_hit=p_hit, p_rand=0.02, p_lost=0.1, sigma=0.06, surface_offset=0.3)
     readings = random_readings(rng, GRID, 300)
@@ -66,25 +66,25 @@ def test_every_gain_is_the_difference_of_two_evaluations(p_hit: float) -> None:
     occupied = state.maps.occupied.reshape(GRID.shape)
     for c in rng.permutation(GRID.size)[:40]:
         before = log_likelihood(readings, GRID, occupied, model)
-        told = gain_of(state, independent(0.5), c)
+        actual = gain_of(state, independent(0.5), c)
         flip(state, c)
         after = log_likelihood(readings, GRID, occupied, model)
-        assert told == pytest.approx(after - before, abs=1e-4)
+        assert actual == pytest.approx(after - before, abs=1e-4)
 
 
 AREA = Grid(0.1, -5, 3, 40, 30)
-"""Large enough for rounds of many flips."""
+"""Large enough for rounds with many flips."""
 
 
 @settings(max_examples=40, deadline=None)
 @given(st.integers(0, 2**32 - 1), st.sampled_from([0.5, 0.2, 0.05]), st.booleans(), st.sampled_from([GRID, AREA]))
-def test_the_objective_never_falls_and_ends_at_an_optimum(seed: int, prior: float, shifts: bool, grid: Grid) -> None:
+def test_objective_never_falls_and_ends_at_an_optimum(seed: int, prior: float, shifts: bool, grid: Grid) -> None:
     rng = np.random.default_rng(seed)
     some = (random_readings, naive.awkward_readings)[seed % 2]
     readings = some(rng, grid, int(rng.integers(1, 150)))
     search = make(readings, grid, prior=prior, kind=Search if shifts else FlipsAlone)
     maps = search.evidence.state.maps
-    # what the kernels evaluate is compared with the forward model elsewhere, awkward readings included
+    # the values of the kernels are compared with the forward model in other tests, also for edge cases
     exact = some is random_readings
     rounding = 3e-7 * len(readings)
 
@@ -123,7 +123,7 @@ def test_the_objective_never_falls_and_ends_at_an_optimum(seed: int, prior: floa
 
 
 @pytest.mark.parametrize('seed', range(4))
-def test_rounds_flip_many_cells_at_once_and_the_gain_told_is_theirs(seed: int) -> None:
+def test_rounds_flip_many_cells_at_once_and_report_their_gain(seed: int) -> None:
     readings = random_readings(np.random.default_rng(seed), AREA, 800, z_max=2.0)
     readings.half_angle[:] = 0.15
     search = make(readings, AREA, prior=0.4)
@@ -142,8 +142,8 @@ def test_rounds_flip_many_cells_at_once_and_the_gain_told_is_theirs(seed: int) -
         assert heights[k] > heights[k - 1]
 
 
-def test_a_round_that_does_not_help_is_taken_back(monkeypatch: pytest.MonkeyPatch) -> None:
-    # all cells that gain, neighbours or not, are far too many
+def test_round_without_gain_is_undone(monkeypatch: pytest.MonkeyPatch) -> None:
+    # all cells with a gain, also neighbours, are far too many
     readings = random_readings(np.random.default_rng(0), AREA, 300)
     search = make(readings, AREA, model=plain_model(p_hit=0.98, p_rand=0.001, p_lost=0.0, sigma=0.3))
     before = search.evidence.state.maps.evidence.copy()
@@ -171,7 +171,7 @@ def test_at_the_end_no_shift_gains(seed: int) -> None:
 
 @pytest.mark.parametrize('seed', range(6))
 @pytest.mark.parametrize('grid', [GRID, AREA], ids=['small', 'large'])
-def test_mirrored_or_turned_readings_give_the_mirrored_or_turned_map(seed: int, grid: Grid) -> None:
+def test_turned_or_mirrored_readings_give_the_turned_or_mirrored_map(seed: int, grid: Grid) -> None:
     readings = random_readings(np.random.default_rng(seed), grid, 200, z_max=1.5)
     plain = make(readings, grid).run()
     mirror = dataclasses.replace(readings, x=-readings.x, yaw=math.pi - readings.yaw)
@@ -219,7 +219,7 @@ def test_alpha_zero_leaves_the_prior() -> None:
     assert q == pytest.approx(0.3)
 
 
-def test_the_search_finds_the_best_map_of_all_mostly(record_property: object) -> None:
+def test_search_finds_the_globally_best_map_in_most_cases(record_property: object) -> None:
     grid = Grid(0.1, 0, 0, 4, 3)
     maps = np.array(list(itertools.product((0, 1), repeat=grid.size)), np.uint8)
     reached, lost, cases = 0, [], 40
@@ -235,14 +235,14 @@ def test_the_search_finds_the_best_map_of_all_mostly(record_property: object) ->
     assert reached >= 0.7 * cases
 
 
-def test_evidence_is_zero_where_nothing_was_seen() -> None:
+def test_evidence_of_unseen_cells_is_zero() -> None:
     readings = Readings.from_columns(x=0.05, y=0.05, yaw=0.0, z=[0.3], z_max=1.0, half_angle=0.1)
     result = make(readings).run()
     assert (result.evidence.reshape(GRID.shape)[4:] == 0).all()
     assert result.occupied.reshape(GRID.shape)[0, 3] == 1
 
 
-def test_many_readings_that_round_alike_do_not_make_the_search_go_round() -> None:
+def test_search_of_many_equally_rounded_readings_converges() -> None:
     silent, echoes = 10_000, 317
     readings = Readings.from_columns(
         x=0.05,
@@ -258,7 +258,7 @@ def test_many_readings_that_round_alike_do_not_make_the_search_go_round() -> Non
         assert make(readings, grid, model).run().converged
 
 
-def test_a_search_can_be_cancelled_before_it_begins_and_at_every_step() -> None:
+def test_search_can_be_cancelled_before_it_begins_and_at_each_step() -> None:
     readings = random_readings(np.random.default_rng(0), AREA, 400, z_max=2.0)
     steps = make(readings, AREA).run().progress.iterations
     assert steps > 4
@@ -275,7 +275,7 @@ def test_a_search_can_be_cancelled_before_it_begins_and_at_every_step() -> None:
         assert search.progress.iterations == last
 
 
-def test_an_empty_map_of_readings_without_echo_is_the_best_at_once() -> None:
+def test_search_of_readings_without_echo_keeps_the_empty_map() -> None:
     readings = random_readings(np.random.default_rng(0), GRID, 60)
     readings.z[:] = readings.z_max
     result = make(readings).run()
@@ -285,7 +285,7 @@ def test_an_empty_map_of_readings_without_echo_is_the_best_at_once() -> None:
     assert (result.evidence <= 0).all()
 
 
-def test_a_search_goes_on_from_the_map_that_it_is_given() -> None:
+def test_search_that_starts_from_its_own_result_changes_nothing() -> None:
     readings = random_readings(np.random.default_rng(4), GRID, 100)
     first = make(readings).run()
     again = make(readings, start=first.occupied).run()
@@ -294,21 +294,21 @@ def test_a_search_goes_on_from_the_map_that_it_is_given() -> None:
     assert (again.progress.flips, again.progress.shifts, again.progress.gain) == (0, 0, 0.0)
 
 
-def test_max_sweeps_ends_the_search_and_says_so() -> None:
+def test_search_at_max_iterations_ends_and_reports_no_convergence() -> None:
     result = make(random_readings(np.random.default_rng(0), GRID, 200), max_iterations=1).run()
     assert not result.converged
     assert result.progress.iterations == 1
 
 
 @pytest.mark.parametrize('most', [1, 2, 3, 5])
-def test_max_sweeps_bounds_rounds_sweeps_and_shifts_together(most: int) -> None:
+def test_max_iterations_counts_rounds_sweeps_and_shifts(most: int) -> None:
     readings = random_readings(np.random.default_rng(0), AREA, 400, z_max=2.0)
     result = make(readings, AREA, max_iterations=most).run()
     assert result.progress.iterations == most
     assert not result.converged
 
 
-# With the prior of walls, traversed cells, gaps and short walls
+# Prior of walls, traversed cells, gaps and short walls
 
 SHAPED = SearchParameters(prior=0.4, wall_cost=1.0, end_cost=1.2)
 ENDS = SearchParameters(prior=0.2, wall_cost=3.0, end_cost=2.5)
@@ -323,7 +323,7 @@ def shaped(readings: Readings, grid: Grid, parameters: SearchParameters, travers
 
 @settings(max_examples=25, deadline=None)
 @given(st.integers(0, 2**32 - 1), st.sampled_from([SHAPED, ENDS]), st.sampled_from([GRID, AREA]))
-def test_with_shapes_the_objective_of_either_stage_never_falls_and_ends_at_an_optimum(
+def test_with_shapes_the_objective_of_each_stage_never_falls(
     seed: int, parameters: SearchParameters, grid: Grid
 ) -> None:
     rng = np.random.default_rng(seed)
@@ -360,11 +360,11 @@ def test_with_shapes_the_objective_of_either_stage_never_falls_and_ends_at_an_op
     state = search.evidence.state
     neighbours = odds_given_neighbours(result.prior, maps.occupied.reshape(grid.shape) == 1)
     for c in range(grid.size):
-        told = gain_of(state, whole, c)
-        assert not maps.seen[c] or told <= LEAST[0] + LEAST[1] * maps.seen[c]
+        actual = gain_of(state, whole, c)
+        assert not maps.seen[c] or actual <= LEAST[0] + LEAST[1] * maps.seen[c]
         sign = -1 if maps.occupied[c] else 1
         odds = sign * naive.prior_gain(whole, maps.occupied, c, grid.shape)
-        # of a traversed cell 1e12 nats, which float64 has to 1e-4
+        # 1e12 nats for a traversed cell, which float64 represents to 1e-4
         assert neighbours[c] == pytest.approx(odds, rel=1e-15, abs=1e-9)
     for c in rng.permutation(grid.size)[:60]:
         maps.occupied[c] ^= 1
@@ -391,7 +391,7 @@ def test_with_shapes_no_shift_gains_at_the_end(seed: int) -> None:
                 assert height(moved) <= end + 4e-4
 
 
-def test_cells_driven_over_stay_free() -> None:
+def test_traversed_cells_stay_free() -> None:
     readings = random_readings(np.random.default_rng(3), AREA, 400, z_max=2.0)
     free = np.zeros(AREA.shape, bool)
     before = shaped(readings, AREA, SHAPED, free)[0].run().occupied
@@ -402,8 +402,8 @@ def test_cells_driven_over_stay_free() -> None:
     assert not (after[traversed.ravel()]).any()
 
 
-def test_no_number_of_readings_occupies_what_was_traversed() -> None:
-    # a robot that stands for two days before what somebody put where it had driven
+def test_traversed_cells_stay_free_after_any_number_of_readings() -> None:
+    # a robot stands for two days in front of an object that was put where it had driven
     reading = Readings.from_columns(x=0.35, y=0.45, yaw=0.0, z=0.5, z_max=4.0, half_angle=0.03)
     evidence = Evidence(GRID, MODEL)
     evidence.extend(reading, np.zeros(3_000_000, np.int64))
@@ -411,12 +411,12 @@ def test_no_number_of_readings_occupies_what_was_traversed() -> None:
     traversed[4] = True
     occupied = Search(evidence, SHAPED, traversed.ravel()).run().occupied.reshape(GRID.shape)
     assert not (occupied & traversed).any()
-    # nor what a tile holds of the map around its window
+    # the same for cells of a tile around its window
     search = Search(evidence, SHAPED, window=(0, 4, 0, 12), hold=True)
     assert not search.improve().occupied.any()
 
 
-def test_a_search_changes_nothing_outside_of_its_window() -> None:
+def test_search_changes_nothing_outside_its_window() -> None:
     readings = random_readings(np.random.default_rng(5), AREA, 400, z_max=2.0)
     evidence = Evidence(AREA, MODEL)
     evidence.extend(readings)
@@ -426,5 +426,5 @@ def test_a_search_changes_nothing_outside_of_its_window() -> None:
     inside = np.zeros(AREA.shape, bool)
     inside[5:20, 8:30] = True
     assert occupied[inside].any()
-    # shifts and gaps may end a cell or a few beyond it
+    # shifts and gaps may end a cell or a few outside
     assert not occupied[naive.box_sum(inside.astype(int)) == 0].any()

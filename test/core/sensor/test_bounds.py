@@ -1,4 +1,4 @@
-"""What one reading can say at most, against the evidence of readings on all kinds of maps."""
+"""Bounds of the evidence from one reading, compared with the evidence of readings on many maps."""
 
 from __future__ import annotations
 
@@ -24,21 +24,21 @@ MODELS = [
 ]
 
 
-def test_with_the_defaults_no_reading_says_more_than_a_few_nats() -> None:
+def test_with_default_parameters_one_reading_gives_a_few_nats_at_most() -> None:
     bounds = reading_bounds(Parameters().model, 0.1, 5.0)
     assert 1.0 < bounds.echo_for < 3.0
     assert -3.0 < bounds.echo_against_wall < bounds.echo_against_cell < -0.5
-    # smooth walls are met without an echo by several readings for each that hears them; a door that is shown by such
-    # readings alone must open all the same
+    # A smooth wall returns no echo for several readings for each one with an echo. A door that only such readings show
+    # must still open.
     assert bounds.echo_for > -5 * bounds.silence_against_wall
     assert -1.0 < bounds.silence_against_wall < bounds.silence_against_cell < -0.05
-    # three echoes outweigh the ends of a wall, two do not
+    # three echoes outweigh the costs of the two ends of a wall, two echoes do not
     assert 2 * bounds.echo_for < 2 * Parameters().search.end_cost < 3 * bounds.echo_for
 
 
 @pytest.mark.parametrize('model', MODELS)
 @pytest.mark.parametrize('seed', range(10))
-def test_no_reading_says_more_on_any_map(model: ModelParameters, seed: int) -> None:
+def test_evidence_of_a_reading_is_within_the_bounds_on_any_map(model: ModelParameters, seed: int) -> None:
     rng = np.random.default_rng(seed)
     readings = dataclasses.replace(random_readings(rng, GRID, 1, z_max=2.0), sigma=np.zeros(1))
     if seed % 2:
@@ -47,20 +47,20 @@ def test_no_reading_says_more_on_any_map(model: ModelParameters, seed: int) -> N
     for filled in (0.0, 0.02, 0.3):
         evidence = Evidence(GRID, model, start=(rng.random(GRID.shape) < filled).astype(np.uint8))
         evidence.extend(readings)
-        told = evidence.of_occupancy()
+        values = evidence.of_occupancy()
         echo = bool(readings.echo[0])
-        assert told.max() <= (bounds.echo_for if echo else 0.0) + 1e-5
-        assert told.min() >= (bounds.echo_against_cell if echo else bounds.silence_against_cell) - 1e-5
+        assert values.max() <= (bounds.echo_for if echo else 0.0) + 1e-5
+        assert values.min() >= (bounds.echo_against_cell if echo else bounds.silence_against_cell) - 1e-5
 
 
 @pytest.mark.parametrize('model', MODELS)
-def test_the_bounds_are_reached(model: ModelParameters) -> None:
+def test_bounds_are_reached(model: ModelParameters) -> None:
     model = dataclasses.replace(model, surface_offset=0.0, max_incidence_angle=math.pi / 2)
     bounds = reading_bounds(model, GRID.resolution, 2.9)
     cell = 10 * GRID.width + 15
     far = 10 * GRID.width + 25
 
-    def told(z: float, *occupied: int) -> float:
+    def evidence_of(z: float, *occupied: int) -> float:
         start = np.zeros(GRID.shape, np.uint8)
         start.ravel()[list(occupied)] = 1
         evidence = Evidence(GRID, model, start=start)
@@ -69,7 +69,7 @@ def test_the_bounds_are_reached(model: ModelParameters) -> None:
         )
         return float(evidence.of_occupancy()[cell])
 
-    assert told(1.5) == pytest.approx(bounds.echo_for, abs=1e-3)
-    assert told(2.9) == pytest.approx(bounds.silence_against_cell, abs=1e-3)
-    # an echo is explained by one cell at most as well as by a whole wall
-    assert bounds.echo_against_cell <= told(2.5, far) < 0
+    assert evidence_of(1.5) == pytest.approx(bounds.echo_for, abs=1e-3)
+    assert evidence_of(2.9) == pytest.approx(bounds.silence_against_cell, abs=1e-3)
+    # one occupied cell explains an echo at most as well as a whole wall does
+    assert bounds.echo_against_cell <= evidence_of(2.5, far) < 0

@@ -1,4 +1,4 @@
-"""The cells of a cone against a test of every cell of the grid."""
+"""Cells of a cone, compared with a test of every cell of the grid."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ MODEL = ModelParameters(surface_offset=0.3)
 
 
 def walked(table: np.ndarray, t: int, grid: Grid) -> dict[int, float]:
-    """Cells that `walk` finds, and their distances in cells."""
+    """Cells that `walk` finds, with their distances in cells."""
     cells, distances = np.empty(grid.size, np.int32), np.empty(grid.size)
     n = walk(table, t, grid.shape, cells, distances)
     found = dict(zip(cells[:n].tolist(), distances[:n].tolist(), strict=True))
@@ -64,7 +64,7 @@ def test_cone_has_the_cells_within_the_angle_and_those_on_the_axis(make: Make, g
 
 
 @pytest.mark.parametrize('make', SOME)
-def test_runs_of_a_row_are_apart_and_from_left_to_right(make: Make) -> None:
+def test_runs_of_a_row_are_separate_and_from_left_to_right(make: Make) -> None:
     readings = make(np.random.default_rng(2), GRID, 200)
     two = 0
     for reading in cone_table(readings, GRID, MODEL):
@@ -84,7 +84,7 @@ def test_runs_of_a_row_are_apart_and_from_left_to_right(make: Make) -> None:
     st.floats(-15, 15) | st.integers(-30, 30).map(lambda n: n / 2),
     st.floats(-1, 12) | st.integers(-2, 24).map(lambda n: n / 2),
 )
-def test_within_is_the_run_of_cells_that_are_near_enough(x: float, v: float, radius: float) -> None:
+def test_within_returns_the_cells_nearer_than_the_radius(x: float, v: float, radius: float) -> None:
     first, last = within(x, v, radius)
     away = {column: math.hypot(column + 0.5 - x, v) for column in range(-20, 40)}
     for column, d in away.items():
@@ -92,8 +92,8 @@ def test_within_is_the_run_of_cells_that_are_near_enough(x: float, v: float, rad
             assert (first <= column <= last) == (d <= radius)
 
 
-def test_a_sensor_on_an_edge_of_cells_sees_one_of_the_two_rows_along_it() -> None:
-    # the axis runs between two rows: it belongs to one of them, whichever way it looks
+def test_axis_along_an_edge_of_cells_belongs_to_one_of_the_two_rows() -> None:
+    # the axis runs between two rows: it belongs to one of them, in both directions
     grid = Grid(0.1, -10, -10, 20, 20)
     readings = Readings.from_columns(
         x=0.0, y=0.0, yaw=[0.0, math.pi, -math.pi, math.pi / 2, -math.pi / 2], z=[0.5] * 5, z_max=2.0, half_angle=1e-9
@@ -103,14 +103,15 @@ def test_a_sensor_on_an_edge_of_cells_sees_one_of_the_two_rows_along_it() -> Non
         rows, columns = np.divmod(list(walked(table, t, grid)), grid.width)
         across, along = (rows, columns) if t < 3 else (columns, rows)
         assert set(across.tolist()) in ({9}, {10})
-        # out to 0.5 m and five times half a cell; it begins on the corner of a cell behind, which belongs or not
+        # out to 0.5 m and five times half a cell; it begins on the corner of a cell behind, which may belong to it or
+        # not
         assert set(along.tolist()) | {10} == set(range(10, 17) if t in (0, 3) else range(3, 11))
     cone = cone_of(table[0])
     assert [axis_run(cone, row)[1] >= axis_run(cone, row)[0] for row in (9, 10, 11)] == [False, True, False]
 
 
 @pytest.mark.parametrize('half_angle', [1.5, 1.55, math.pi / 2 - 1e-6])
-def test_a_cone_of_nearly_half_a_turn_is_all_that_is_ahead(half_angle: float) -> None:
+def test_cone_of_nearly_180_degrees_has_all_cells_ahead(half_angle: float) -> None:
     grid = Grid(0.1, -30, -30, 60, 60)
     rng = np.random.default_rng(3)
     for _ in range(20):
@@ -122,12 +123,12 @@ def test_a_cone_of_nearly_half_a_turn_is_all_that_is_ahead(half_angle: float) ->
         ahead = du * math.cos(yaw) + dv * math.sin(yaw)
         inside = (np.hypot(du, dv) <= 2.0) & (ahead > np.hypot(du, dv) * math.cos(half_angle) + 1e-9)
         assert set(np.flatnonzero(inside).tolist()) <= found
-        # but for those that the axis crosses on its first cell
+        # except cells that the axis crosses on its first cell
         behind = np.array([ahead.ravel()[c] for c in found - set(np.flatnonzero(inside).tolist())])
         assert (np.abs(behind) < 0.16).all()
 
 
-def test_a_walk_says_how_many_cells_there_are_where_it_has_too_little_room() -> None:
+def test_walk_into_a_small_array_returns_the_number_of_all_cells() -> None:
     readings = random_readings(np.random.default_rng(4), GRID, 20)
     table = cone_table(readings, GRID, ModelParameters())
     for t in range(len(readings)):
@@ -140,14 +141,14 @@ def test_a_walk_says_how_many_cells_there_are_where_it_has_too_little_room() -> 
 
 
 @pytest.mark.parametrize('make', SOME)
-def test_the_grid_of_readings_cuts_off_no_cell(make: Make) -> None:
+def test_grid_of_readings_contains_all_cells_of_their_cones(make: Make) -> None:
     readings, model = make(np.random.default_rng(5), GRID, 150), MODEL
     parameters = GridParameters(resolution=GRID.resolution)
     for t in range(len(readings)):
         one = readings.select(slice(t, t + 1))
         made = grid_of(one, model, parameters)
         wide = Grid(made.resolution, made.column - 5, made.row - 5, made.width + 10, made.height + 10)
-        # what only touches it may fall to either side
+        # cells that only touch it may be inside or outside
         rows, columns = np.divmod(np.array([*naive.cells_of(one, 0, wide, model, slack=-1e-9)], int), wide.width)
         assert ((rows >= 5) & (rows < 5 + made.height)).all()
         assert ((columns >= 5) & (columns < 5 + made.width)).all()
@@ -155,7 +156,7 @@ def test_the_grid_of_readings_cuts_off_no_cell(make: Make) -> None:
 
 
 @pytest.mark.parametrize('offset', [0.0, 0.3])
-def test_cones_are_those_of_the_readings_in_cells(offset: float) -> None:
+def test_cone_table_has_the_readings_in_units_of_cells(offset: float) -> None:
     readings, model = random_readings(np.random.default_rng(6), GRID, 30), ModelParameters(surface_offset=offset)
     table = cone_table(readings, GRID, model)
     sigma = effective_sigma(readings, model, GRID.resolution)
@@ -168,13 +169,13 @@ def test_cones_are_those_of_the_readings_in_cells(offset: float) -> None:
         assert math.atan2(cone['axis_y'], cone['axis_x']) == pytest.approx(math.remainder(readings.yaw[t], 2 * math.pi))
         assert math.atan2(cone['sine'], cone['cosine']) == pytest.approx(readings.half_angle[t])
         lengths = [readings.z[t], readings.z_max[t], naive.free_end(readings, t, GRID, model), reach[t]]
-        # a surface so far away is that of an obstacle whose centre is farther by the offset
+        # the surface at this range belongs to an obstacle whose centre is farther by the offset
         expected = pytest.approx([v / 0.1 + offset for v in lengths])
         assert [cone[k] for k in ('z', 'z_max', 'free', 'reach')] == expected
         assert cone['sigma'] == pytest.approx(sigma[t] / 0.1)
 
 
-def test_a_thin_cone_has_no_holes() -> None:
+def test_thin_cone_has_no_holes() -> None:
     rng = np.random.default_rng(2)
     grid = Grid(0.1, -30, -30, 60, 60)
     model = ModelParameters()
@@ -198,7 +199,7 @@ def test_a_thin_cone_has_no_holes() -> None:
         assert on_axis <= set(zip(rows.tolist(), columns.tolist(), strict=True))
 
 
-def test_boxes_hold_their_cones_tightly() -> None:
+def test_boxes_contain_their_cones_tightly() -> None:
     rng = np.random.default_rng(3)
     n = 200
     x, y, yaw = rng.uniform(-5, 5, n), rng.uniform(-5, 5, n), rng.uniform(-9, 9, n)
@@ -211,19 +212,19 @@ def test_boxes_hold_their_cones_tightly() -> None:
     assert np.abs(boxes - expected).max() < 1e-5
 
 
-def test_where_a_sensor_is_in_its_cell_does_not_depend_on_the_corner_of_the_grid() -> None:
+def test_position_within_a_cell_does_not_depend_on_the_origin_of_the_grid() -> None:
     rng = np.random.default_rng(11)
     readings = random_readings(rng, Grid(0.1, -40, -40, 80, 80), 500)
     near = cone_table(readings, Grid(0.1, -45, -45, 90, 90), MODEL)
     for column, row in ((-3000, 17), (-64, -100_000), (2, 2)):
         other = cone_table(readings, Grid(0.1, column, row, 10, 10), MODEL)
-        # to the bit, though the number of bits before the point differs
+        # bit-identical, although the number of bits before the point differs
         assert np.array_equal(other['x'] + column, near['x'] - 45)
         assert np.array_equal(other['y'] + row, near['y'] - 45)
 
 
 @pytest.mark.parametrize('seed', range(20))
-def test_the_box_of_all_cones_is_that_of_their_boxes(seed: int) -> None:
+def test_box_of_all_cones_is_the_union_of_their_boxes(seed: int) -> None:
     rng = np.random.default_rng(seed)
     n = int(rng.integers(1, 300))
     yaw = np.where(rng.random(n) < 0.3, rng.integers(-9, 9, n) * math.pi / 2, rng.uniform(-9, 9, n))

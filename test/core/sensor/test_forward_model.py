@@ -1,4 +1,4 @@
-"""The forward model against an enumeration of everything that may have happened."""
+"""The forward model, compared with an enumeration of all possible causes of a reading."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ def random_normals(rng: np.random.Generator, grid: Grid, angle: float) -> Surfac
 
 
 @pytest.mark.parametrize('first', range(0, 30, 5))
-def test_with_normals_it_is_that_of_all_correspondences_with_surfaces_that_answer(first: int) -> None:
+def test_log_likelihood_with_normals_omits_surfaces_that_return_no_echo(first: int) -> None:
     passed = 0
     for seed in range(first, first + 5):
         rng = np.random.default_rng(400 + seed)
@@ -61,21 +61,21 @@ def test_with_normals_it_is_that_of_all_correspondences_with_surfaces_that_answe
         readings.sigma[:] *= 0.3
         normals = random_normals(rng, GRID, model.max_incidence_angle)
         occupied = (rng.random(GRID.shape) < 0.7).astype(np.int8)
-        told = expectations(readings, GRID, occupied, model, normals)
+        actual = expectations(readings, GRID, occupied, model, normals)
         for t in range(len(readings)):
             met = sorted(naive.obstacles(readings, t, GRID, occupied, model, normals))
             sigma = naive.sigma_of(readings, t, GRID, model)
             terms = naive.causes(readings.z[t], readings.z_max[t], sigma, met, model)
-            assert told.log_likelihood[t] == pytest.approx(math.log(sum(terms)), abs=1e-8)
-            assert told.random[t] == pytest.approx(terms[0] / sum(terms), abs=1e-8)
-            assert told.obstacles[t] == len(met)
+            assert actual.log_likelihood[t] == pytest.approx(math.log(sum(terms)), abs=1e-8)
+            assert actual.random[t] == pytest.approx(terms[0] / sum(terms), abs=1e-8)
+            assert actual.obstacles[t] == len(met)
             passed += len(naive.obstacles(readings, t, GRID, occupied, model)) - len(met)
         expected = naive.log_likelihood(readings, GRID, occupied, model, normals)
         assert log_likelihood(readings, GRID, occupied, model, normals) == pytest.approx(expected, abs=1e-6)
     assert passed > 0
 
 
-def test_other_values_of_the_model_leave_the_choice_of_surfaces_as_it_is() -> None:
+def test_at_another_model_the_omitted_surfaces_stay_the_same() -> None:
     rng = np.random.default_rng(9)
     readings = random_readings(rng, GRID, 200)
     readings.sigma[:] = 0
@@ -83,7 +83,7 @@ def test_other_values_of_the_model_leave_the_choice_of_surfaces_as_it_is() -> No
     forward = ForwardModel(readings, GRID, model, random_normals(rng, GRID, 0.6))
     occupied = (rng.random(GRID.shape) < 0.7).astype(np.int8)
     wider = dataclasses.replace(model, sigma=0.3)
-    # with every obstacle as far as the reading, the number of obstacles depends on the reach alone
+    # if every obstacle is as far as the reading, the number of obstacles depends only on the reach
     plain = ForwardModel(readings, GRID, wider).expectations(occupied).obstacles
     fresh = ForwardModel(readings, GRID, wider, forward.normals).expectations(occupied).obstacles
     kept = forward.at(wider).expectations(occupied).obstacles
@@ -113,7 +113,7 @@ def test_expectations_are_the_share_of_each_cause(seed: int) -> None:
 
 
 @pytest.mark.parametrize('seed', range(10))
-def test_the_sum_over_obstacles_is_that_over_all_that_may_have_happened(seed: int) -> None:
+def test_sum_over_obstacles_equals_the_sum_over_all_causes(seed: int) -> None:
     rng = np.random.default_rng(200 + seed)
     model = random_model(rng)
     for met in (rng.uniform(0, 2, n).tolist() for n in range(9)):
@@ -123,20 +123,20 @@ def test_the_sum_over_obstacles_is_that_over_all_that_may_have_happened(seed: in
 
 
 @pytest.mark.parametrize('seed', range(6))
-def test_awkward_readings_have_the_likelihood_of_their_cells(seed: int) -> None:
+def test_likelihood_of_edge_case_readings_is_that_of_their_cells(seed: int) -> None:
     rng = np.random.default_rng(300 + seed)
     grid = Grid(0.1, -7, 2, 13, 11)
     readings, model = naive.awkward_readings(rng, grid, 60), random_model(rng)
     occupied = (rng.random(grid.shape) < 0.2).astype(np.int8)
-    told = expectations(readings, grid, occupied, model).log_likelihood
+    actual = expectations(readings, grid, occupied, model).log_likelihood
     for t in range(len(readings)):
         z, z_max, sigma = readings.z[t], readings.z_max[t], naive.sigma_of(readings, t, grid, model)
         away = naive.cells_of(readings, t, grid, model, 1e-9)
         ties = [abs(abs(z - d) - CUT * sigma) < 1e-9 for d in [*away.values(), z_max]]
-        # where rounding does not tell what belongs to the cone, or to the noise
+        # without readings where rounding decides which cells belong to the cone or are within the noise
         if not any(ties) and set(away) == set(naive.cells_of(readings, t, grid, model, -1e-9)):
             met = [d for c, d in away.items() if occupied.ravel()[c]]
-            assert told[t] == pytest.approx(math.log(naive.likelihood(z, z_max, sigma, met, model)), abs=1e-9)
+            assert actual[t] == pytest.approx(math.log(naive.likelihood(z, z_max, sigma, met, model)), abs=1e-9)
 
 
 def test_p_lost_of_zero_is_the_papers_model() -> None:
@@ -146,7 +146,7 @@ def test_p_lost_of_zero_is_the_papers_model() -> None:
     assert (expectations(readings, GRID, occupied, ModelParameters(p_lost=0.0)).lost == 0).all()
 
 
-def test_a_lost_echo_is_a_cause_of_readings_without_echo_alone() -> None:
+def test_only_readings_without_echo_have_the_cause_lost() -> None:
     readings = random_readings(np.random.default_rng(7), GRID, 40)
     readings.z[:10] = readings.z_max[:10] - 0.01
     readings.z[10:20] = readings.z_max[10:20]
@@ -169,7 +169,7 @@ def sample(rng: np.random.Generator, readings, grid, occupied, model):
 
 
 @pytest.mark.slow
-def test_learning_recovers_the_truth_when_it_knows_the_map() -> None:
+def test_learning_on_the_true_map_finds_the_true_parameters() -> None:
     rng = np.random.default_rng(5)
     grid = Grid(0.1, 0, 0, 30, 30)
     truth = ModelParameters(p_hit=0.4, p_rand=0.1, p_lost=0.2, sigma=0.07)
@@ -202,9 +202,9 @@ def test_learning_never_lowers_the_likelihood() -> None:
 
 
 @pytest.mark.parametrize('parts', [2, 4])
-def test_a_wall_is_heard_alike_in_cells_of_any_size(parts: int) -> None:
+def test_likelihood_of_a_wall_does_not_depend_on_the_cell_size(parts: int) -> None:
     model = ModelParameters(p_hit=0.6, p_rand=0.1, p_lost=0.1, sigma=0.1, surface_offset=0.0)
-    told = []
+    actual = []
     for k in (1, parts):
         grid = Grid(0.1 / k, 0, 0, 20 * k, 20 * k)
         wall = np.zeros(grid.shape, np.uint8)
@@ -213,12 +213,12 @@ def test_a_wall_is_heard_alike_in_cells_of_any_size(parts: int) -> None:
         readings = Readings.from_columns(
             x=1.0, y=0.0, yaw=math.pi / 2, z=[1.05, 0.5, 2.0], z_max=2.0, half_angle=0.3, stamp=np.arange(3)
         )
-        told.append(expectations(readings, grid, wall, model).log_likelihood)
-    assert told[1] == pytest.approx(told[0], abs=0.1)
+        actual.append(expectations(readings, grid, wall, model).log_likelihood)
+    assert actual[1] == pytest.approx(actual[0], abs=0.1)
 
 
 @pytest.mark.parametrize('resolution', [0.01, 0.1, 0.3])
-def test_p_hit_of_a_cell_and_back(resolution: float) -> None:
+def test_p_hit_is_converted_to_the_cell_size_and_back(resolution: float) -> None:
     for p_hit in (0.01, 0.3, 0.7, 0.9):
         model = ModelParameters(p_hit=p_hit)
         of_cell = hit_probability(model, resolution)

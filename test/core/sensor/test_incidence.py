@@ -1,4 +1,4 @@
-"""Up to which incidence surfaces return echoes, and what that makes of readings that went past them."""
+"""The incidence angle up to which surfaces return echoes, and its effect on readings that passed them."""
 
 from __future__ import annotations
 
@@ -36,8 +36,8 @@ WHOLE = (0, GRID.height, 0, GRID.width)
 WALL = 3.0
 
 
-def before_wall(heard_up_to: float, share: float = 1.0, count: int = 400, seed: int = 0) -> Readings:
-    """Readings at all slants of a wall at y = 3, of which a share of those up to an incidence hear it."""
+def before_wall(echo_up_to: float, share: float = 1.0, count: int = 400, seed: int = 0) -> Readings:
+    """Readings at all incidence angles to a wall at y = 3; a share of those up to `echo_up_to` have an echo of it."""
     rng = np.random.default_rng(seed)
     readings = random_readings(rng, GRID, count, z_max=3.4)
     readings.x[:] = rng.uniform(-1.5, 1.5, count)
@@ -45,7 +45,7 @@ def before_wall(heard_up_to: float, share: float = 1.0, count: int = 400, seed: 
     off = rng.uniform(-0.65, 0.65, count)
     readings.yaw[:] = math.pi / 2 + off
     readings.half_angle[:] = 0.05
-    heard = (np.abs(off) < heard_up_to) & (rng.random(count) < share)
+    heard = (np.abs(off) < echo_up_to) & (rng.random(count) < share)
     readings.z[:] = np.where(heard, (WALL - readings.y) / np.cos(off), readings.z_max)
     return readings
 
@@ -71,7 +71,7 @@ def counted(
 
 
 def limit_of(readings: Readings) -> np.ndarray:
-    """The incidence angle of each cell whose normal is known, radians, NaN elsewhere."""
+    """The incidence angle of each cell with known normal, radians; NaN elsewhere."""
     evidence = Evidence(GRID, MODEL)
     evidence.extend(readings)
     normals = evidence.state.normals
@@ -87,7 +87,7 @@ ROW = round(WALL / 0.1) - GRID.row
 @pytest.mark.parametrize(
     'readings', [before_wall(0.3, 0.9, 120), random_readings(np.random.default_rng(1), GRID, 80)], ids=['wall', 'any']
 )
-def test_what_is_counted_is_what_the_twin_counts(readings: Readings) -> None:
+def test_counts_are_those_of_the_twin(readings: Readings) -> None:
     normals = unit_normals(readings)
     counts, slots = counted(readings, normals)
     expected = naive.met(readings, GRID, MODEL, normals, tuple(ANGLES)).reshape(2 * ZONES, -1)
@@ -99,7 +99,7 @@ def test_what_is_counted_is_what_the_twin_counts(readings: Readings) -> None:
     assert expected[ZONES:].sum() > 5
 
 
-def test_parts_of_readings_and_of_the_map_sum_up_to_the_whole() -> None:
+def test_counts_of_parts_of_readings_and_map_sum_up_to_the_whole() -> None:
     readings = before_wall(0.3, 0.9, 150)
     normals = unit_normals(readings)
     whole, slots = counted(readings, normals)
@@ -118,7 +118,7 @@ def test_parts_of_readings_and_of_the_map_sum_up_to_the_whole() -> None:
 @settings(max_examples=200, deadline=None)
 @given(st.lists(st.integers(0, 30 * 64), min_size=2 * ZONES, max_size=2 * ZONES))
 def test_limits_are_those_of_the_twin(quanta: list[int]) -> None:
-    # counts are whole numbers of quanta, whose sums are exact: an empty zone is a tie for both
+    # counts are multiples of quanta, so sums are exact: an empty zone is a tie for both implementations
     counts = np.array(quanta) / 64
     assert limit(counts) == naive.incidence_limit(counts[:ZONES], counts[ZONES:])
 
@@ -136,20 +136,20 @@ def test_limits_of_typical_surfaces() -> None:
     assert zone([0, 0, 0], [0, 0, 0]) == 2, 'nothing'
 
 
-@pytest.mark.parametrize(('heard_up_to', 'zone'), [(0.65, 2), (0.49, 1), (0.25, 0)])
-def test_a_wall_has_the_incidence_angle_up_to_which_it_is_heard(heard_up_to: float, zone: int) -> None:
-    told = limit_of(before_wall(heard_up_to, 0.95, 1200))[ROW, 15:35]
-    assert np.isfinite(told).sum() > 15
-    assert np.isclose(told, ANGLES[zone], atol=1e-3).sum() > 0.8 * np.isfinite(told).sum()
+@pytest.mark.parametrize(('echo_up_to', 'zone'), [(0.65, 2), (0.49, 1), (0.25, 0)])
+def test_wall_gets_the_incidence_angle_up_to_which_it_returns_echoes(echo_up_to: float, zone: int) -> None:
+    actual = limit_of(before_wall(echo_up_to, 0.95, 1200))[ROW, 15:35]
+    assert np.isfinite(actual).sum() > 15
+    assert np.isclose(actual, ANGLES[zone], atol=1e-3).sum() > 0.8 * np.isfinite(actual).sum()
 
 
-def test_a_place_through_which_readings_went_has_that_of_the_model() -> None:
-    told = limit_of(before_wall(0.25, 0.2))[ROW, 15:35]
-    assert np.nanmin(told) == pytest.approx(MODEL.max_incidence_angle, abs=1e-3)
+def test_cells_passed_by_readings_get_the_incidence_angle_of_the_model() -> None:
+    actual = limit_of(before_wall(0.25, 0.2))[ROW, 15:35]
+    assert np.nanmin(actual) == pytest.approx(MODEL.max_incidence_angle, abs=1e-3)
 
 
 @pytest.mark.parametrize('grid', [GRID, Grid(0.05, -50, 0, 100, 80)], ids=['whole cells', 'parts of cells'])
-def test_lengths_are_those_of_what_is_summed_around_a_cell(grid: Grid) -> None:
+def test_lengths_of_normals_follow_from_sums_around_each_cell(grid: Grid) -> None:
     readings, whole = before_wall(0.45, 0.9), (0, grid.height, 0, grid.width)
     normals = unit_normals(readings, grid)
     counts, slots = counted(readings, normals, whole, grid=grid)
@@ -170,7 +170,7 @@ def test_lengths_are_those_of_what_is_summed_around_a_cell(grid: Grid) -> None:
         assert made.y[c] == pytest.approx(normals.y[c] * length, abs=1e-6)
         seen.add(zone)
     assert seen == set(range(ZONES))
-    # and of a part of the map they are what they are on the whole of it
+    # for a part of the map they are the same as in the whole
     bottom, top, left, right = (20, 32, 10, 30) if grid is GRID else (40, 64, 20, 60)
     again = narrowed(unit_normals(readings, grid), counts, slots, edges_of(MODEL), grid, (bottom, top, left, right))
     inside = (slice(bottom, top), slice(left, right))
@@ -179,7 +179,7 @@ def test_lengths_are_those_of_what_is_summed_around_a_cell(grid: Grid) -> None:
     assert np.array_equal(again.x, normals.x)
 
 
-def test_a_smooth_wall_is_not_contradicted_by_readings_that_could_not_hear_it() -> None:
+def test_smooth_wall_is_not_contradicted_by_readings_at_large_incidence() -> None:
     wall = np.zeros(GRID.shape, np.uint8)
     wall[ROW, 10:40] = 1
 
@@ -194,7 +194,7 @@ def test_a_smooth_wall_is_not_contradicted_by_readings_that_could_not_hear_it() 
     assert gained_by_freeing(smooth, own) < gained_by_freeing(smooth, unit_normals(smooth))
 
 
-def test_a_mirrored_drive_has_mirrored_incidence_angles() -> None:
+def test_mirrored_drive_has_mirrored_incidence_angles() -> None:
     readings = before_wall(0.3, 0.8)
     mirrored = Readings.from_columns(
         readings.sensor_names,
@@ -204,7 +204,7 @@ def test_a_mirrored_drive_has_mirrored_incidence_angles() -> None:
             'yaw': math.pi - readings.yaw,
         },
     )
-    told = limit_of(readings)
-    differ = ~np.isclose(limit_of(mirrored)[:, ::-1], told, atol=1e-4, equal_nan=True)
-    # readings that meet a cell right on the edge of a zone or a cone may round either way
-    assert differ.sum() <= 0.02 * np.isfinite(told).sum()
+    actual = limit_of(readings)
+    differ = ~np.isclose(limit_of(mirrored)[:, ::-1], actual, atol=1e-4, equal_nan=True)
+    # readings that meet a cell exactly on the edge of a zone or a cone may be rounded to either side
+    assert differ.sum() <= 0.02 * np.isfinite(actual).sum()

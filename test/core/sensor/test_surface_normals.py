@@ -1,4 +1,4 @@
-"""Normals of surfaces, and the pairs that are left out where a reading exceeds the incidence angle."""
+"""Normals of surfaces, and pairs that are omitted because a reading exceeds the incidence angle."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ MODEL = ModelParameters(sigma=0.06, p_hit=0.6, p_rand=0.1, p_lost=0.1, max_incid
 
 
 def along_wall(count: int = 150, seed: int = 0) -> Readings:
-    """Readings of a robot that passes a wall at y = 3, at all slants, many of which heard nothing of it."""
+    """Readings of a robot that passes a wall at y = 3, at all incidence angles; many have no echo of it."""
     rng = np.random.default_rng(seed)
     readings = random_readings(rng, GRID, count, z_max=2.5)
     readings.y[:] = 1.5 + 0.3 * rng.random(count)
@@ -68,8 +68,8 @@ def test_normals_are_those_of_the_twin(readings: Readings) -> None:
     evidence = made(readings, model)
     sums = sums_of(evidence, (0, len(readings)))
     expected = naive.normals(readings, GRID, model)
-    for told, exact in zip(sums, expected, strict=True):
-        assert np.abs(told.reshape(GRID.shape) * QUANTUM - exact).max() < 1e-3
+    for actual, exact in zip(sums, expected, strict=True):
+        assert np.abs(actual.reshape(GRID.shape) * QUANTUM - exact).max() < 1e-3
     halves = sums_of(evidence, (0, 37)) + sums_of(evidence, (37, len(readings)))
     assert np.array_equal(halves, sums)
     normals = normals_of(sums, GRID, model.max_incidence_angle)
@@ -88,7 +88,7 @@ def test_normals_are_those_of_the_twin(readings: Readings) -> None:
     assert 5 < normals.known.sum() < GRID.size
 
 
-def test_the_normal_of_a_wall_is_across_it() -> None:
+def test_normals_of_a_wall_are_perpendicular_to_it() -> None:
     evidence = made(along_wall())
     normals = normals_of(sums_of(evidence, (0, len(evidence))), GRID, MODEL.max_incidence_angle)
     row = round(3.0 / 0.1) - GRID.row
@@ -100,9 +100,7 @@ def test_the_normal_of_a_wall_is_across_it() -> None:
 @pytest.mark.parametrize(
     ('resolution', 'within', 'part'), [(0.1, 1, 1.0), (0.05, 3, 0.5), (0.06, 2, 1.0), (0.4, 0, 1.0)]
 )
-def test_sums_are_over_a_square_in_metres_of_which_the_edge_may_be_parts_of_cells(
-    resolution: float, within: int, part: float
-) -> None:
+def test_box_sums_cover_a_square_in_metres_with_fractions_of_cells(resolution: float, within: int, part: float) -> None:
     rng = np.random.default_rng(0)
     values = rng.integers(-1000, 1000, (9, 12))
     weights = np.ones(2 * within + 1)
@@ -126,12 +124,12 @@ def test_sums_are_over_a_square_in_metres_of_which_the_edge_may_be_parts_of_cell
 
     whole = box_sums(0, 9, 0, 12)
     assert whole == pytest.approx(expected, abs=1e-9)
-    # to the bit, so that what is renewed is what would be estimated at once
+    # bit-identical, so that renewed normals equal normals estimated at once
     for bottom, top, left, right in ((0, 1, 0, 1), (2, 9, 0, 5), (8, 9, 11, 12), (1, 4, 3, 12)):
         assert np.array_equal(box_sums(bottom, top, left, right), whole[bottom:top, left:right])
 
 
-def test_the_same_wall_has_its_normals_in_cells_of_any_size() -> None:
+def test_share_of_known_normals_does_not_depend_on_the_cell_size() -> None:
     readings, share = along_wall(400), []
     for parts in (1, 2, 4):
         grid = Grid(0.1 / parts, GRID.column * parts, GRID.row * parts, GRID.width * parts, GRID.height * parts)
@@ -141,24 +139,24 @@ def test_the_same_wall_has_its_normals_in_cells_of_any_size() -> None:
     assert share == pytest.approx([share[0]] * 3, rel=0.15)
 
 
-def test_readings_without_echo_tell_no_normal() -> None:
+def test_readings_without_echo_give_no_normals() -> None:
     readings = along_wall()
     readings.z[:] = readings.z_max
     assert not made(readings).state.normals.known.any()
 
 
-def test_a_straight_angle_leaves_out_nothing() -> None:
+def test_limit_of_90_degrees_omits_no_pairs() -> None:
     readings = along_wall()
     for angle in (math.pi / 2, 1.5708):
         evidence = made(readings, dataclasses.replace(MODEL, max_incidence_angle=angle))
         assert evidence.state.normals.cos2_limit == no_normals().cos2_limit == 0.0
-    # all surfaces graze nobody where the angle has hardly any cosine
+    # at a limit whose cosine is nearly zero, no reading exceeds it
     sums = sums_of(evidence, (0, len(readings)))
     assert normals_of(sums, GRID, math.pi / 2).cos2_limit < 1e-12
 
 
 @pytest.mark.parametrize('readings', [along_wall(), random_readings(np.random.default_rng(2), GRID, 120)])
-def test_pairs_are_those_of_the_cone_without_what_is_grazed(readings: Readings) -> None:
+def test_pairs_are_those_of_the_cone_without_grazed_cells(readings: Readings) -> None:
     model = MODEL
     evidence, plain = made(readings, model), made(readings, dataclasses.replace(model, max_incidence_angle=math.pi / 2))
     s = evidence.state
@@ -183,7 +181,7 @@ def test_pairs_are_those_of_the_cone_without_what_is_grazed(readings: Readings) 
         n = find_observing(s, c)
         assert n == len(found[c])
         assert {int(t): int(zone) for t, zone in s.observing[:n]} == found[c]
-    # a cell that is only grazed is seen all the same
+    # a cell that is only grazed counts as seen
     assert np.array_equal(s.maps.seen, plain.state.maps.seen)
 
 
@@ -202,7 +200,7 @@ def snapshot(evidence: Evidence) -> list[object]:
     st.integers(0, 2**32 - 1),
     st.lists(st.integers(0, GRID.size - 1), max_size=20),
 )
-def test_after_flips_all_is_as_if_built_from_the_new_map(seed: int, cells: list[int]) -> None:
+def test_state_after_flips_equals_a_state_built_from_the_new_map(seed: int, cells: list[int]) -> None:
     readings, model = along_wall(60, seed), MODEL
     start = np.random.default_rng(seed).random(GRID.shape) < 0.1
     evidence, unstored = (made(readings, model, memory=m, start=start) for m in (math.inf, 0.0))
@@ -217,7 +215,7 @@ def test_after_flips_all_is_as_if_built_from_the_new_map(seed: int, cells: list[
     assert snapshot(evidence) == fresh
 
 
-def test_threads_change_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_number_of_threads_does_not_change_the_state(monkeypatch: pytest.MonkeyPatch) -> None:
     one = made(along_wall())
     monkeypatch.setattr(threads, 'LEAST_PART', 20)
     assert len(threads.parts(0, 150, 3)) == 3
@@ -228,7 +226,7 @@ def test_threads_change_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
     assert snapshot(less) == snapshot(one)
 
 
-def test_a_grid_that_grew_faces_as_if_it_had_been_larger_from_the_start() -> None:
+def test_state_on_a_grown_grid_equals_that_on_a_large_grid() -> None:
     readings = along_wall()
     large = Grid(0.1, GRID.column - 11, GRID.row - 3, GRID.width + 30, GRID.height + 17)
     grown, whole = made(readings), Evidence(large, MODEL)
@@ -237,7 +235,7 @@ def test_a_grid_that_grew_faces_as_if_it_had_been_larger_from_the_start() -> Non
     assert snapshot(grown) == snapshot(whole)
 
 
-def test_normals_on_a_larger_grid_are_those_of_the_same_places() -> None:
+def test_normals_on_a_larger_grid_stay_in_place() -> None:
     normals = made(along_wall()).state.normals
     large = Grid(0.1, GRID.column - 11, GRID.row - 3, GRID.width + 30, GRID.height + 17)
     wide = on_larger_grid(normals, GRID, large)
@@ -245,9 +243,9 @@ def test_normals_on_a_larger_grid_are_those_of_the_same_places() -> None:
     rows, columns = GRID.cells_of(*np.meshgrid(xs, ys))
     inside = (rows >= 0) & (rows < GRID.height) & (columns >= 0) & (columns < GRID.width)
     for name in ('known', 'x', 'y'):
-        told, expected = getattr(wide, name).reshape(large.shape), getattr(normals, name).reshape(GRID.shape)
-        assert np.array_equal(told[inside], expected[rows[inside], columns[inside]])
-        assert not told[~inside].any()
+        actual, expected = getattr(wide, name).reshape(large.shape), getattr(normals, name).reshape(GRID.shape)
+        assert np.array_equal(actual[inside], expected[rows[inside], columns[inside]])
+        assert not actual[~inside].any()
     known = wide.known.reshape(large.shape)
     assert known.any()
     assert all(wide.before[row, k] == known[row, :k].sum() for row, k in np.ndindex(wide.before.shape))
@@ -255,7 +253,7 @@ def test_normals_on_a_larger_grid_are_those_of_the_same_places() -> None:
     assert on_larger_grid(no_normals(), GRID, large).cos2_limit == 0.0
 
 
-def test_what_is_grazed_is_not_contradicted() -> None:
+def test_grazing_readings_do_not_contradict_a_wall() -> None:
     readings = along_wall()
     row = round(3.0 / 0.1) - GRID.row
     wall = np.zeros(GRID.shape, np.uint8)
@@ -264,11 +262,11 @@ def test_what_is_grazed_is_not_contradicted() -> None:
         made(readings, model, start=wall).state.maps.evidence.reshape(GRID.shape)[row, 5:20]
         for model in (MODEL, plain_model(sigma=0.06, p_hit=0.6, p_rand=0.1, p_lost=0.1))
     )
-    # what freeing a cell of the wall gains
+    # evidence for freeing a cell of the wall
     assert graze.sum() < plain.sum()
 
 
-def test_only_what_a_reading_goes_through_can_be_grazed() -> None:
+def test_incidence_angle_applies_only_to_cells_nearer_than_the_range() -> None:
     normals = no_normals()._replace(
         known=np.ones(1, np.uint8), x=np.ones(1, np.float32), y=np.zeros(1, np.float32), cos2_limit=math.cos(0.7) ** 2
     )

@@ -1,4 +1,4 @@
-"""Tiles against the whole: what they take, that what a window says is exact, and that seams do not show."""
+"""Tiles compared with the whole map: their readings, exact windows, and invisible seams."""
 
 from __future__ import annotations
 
@@ -66,7 +66,7 @@ def with_normals(made: Mosaic, parameters: Parameters) -> Mosaic:
 
 @settings(max_examples=10, deadline=None)
 @given(seed=st.integers(0, 10**6), size=st.floats(0.8, 9.0))
-def test_every_reading_that_touches_a_window_is_its_own(seed: int, size: float) -> None:
+def test_tile_has_all_readings_that_touch_its_window(seed: int, size: float) -> None:
     p = Parameters()
     readings = random_readings(np.random.default_rng(seed), AREA, 12, z_max=3.0)
     grid = map_grid(readings, p)
@@ -103,12 +103,12 @@ def test_every_reading_that_touches_a_window_is_its_own(seed: int, size: float) 
     assert sorted(number for colour in tiling.colours for number in colour) == list(range(len(tiling.tiles)))
 
 
-# ---- what is said of a window
+# ---- windows
 
 
 @pytest.mark.parametrize('size', [2.0, 5.0])
 @pytest.mark.parametrize('settings', [{}, PAPER])
-def test_normals_evidence_and_maps_of_cores_are_those_of_the_whole(size: float, settings: dict[str, Any]) -> None:
+def test_normals_evidence_and_maps_of_cores_equal_those_of_the_whole(size: float, settings: dict[str, Any]) -> None:
     p, maps = Parameters().varied(settings), whole(**settings)
     made = with_normals(mosaic(tour(), p, size), p)
     np.testing.assert_array_equal(made.all_normals().x, maps.normals.x)
@@ -136,7 +136,7 @@ def test_normals_evidence_and_maps_of_cores_are_those_of_the_whole(size: float, 
     assert searched == pytest.approx(maps.statistics['searched_log_likelihood'], abs=1e-6)
 
 
-def test_what_is_held_stays() -> None:
+def test_held_cells_do_not_change() -> None:
     p = Parameters()
     rng = np.random.default_rng(3)
     readings = in_canonical_order(tour())
@@ -192,7 +192,7 @@ def test_no_flip_gains_anywhere_at_the_end(size: float, settings: dict[str, Any]
     assert maps.statistics['searched_objective'] >= best - 0.003 * abs(best)
 
 
-def test_one_tile_is_the_whole() -> None:
+def test_single_tile_gives_the_whole_map() -> None:
     maps, reference = TiledMapper(Parameters(), 1000.0).run(tour()), whole()
     assert maps.statistics['tiles'] <= 4
     if maps.statistics['tiles'] == 1:
@@ -217,16 +217,16 @@ def test_maps_do_not_depend_on_how_many_tiles_are_searched_at_once() -> None:
         assert other.statistics['flips'] == maps[0].statistics['flips']
 
 
-def test_tiles_of_the_corridor_as_small_as_a_cone() -> None:
+def test_tiles_as_small_as_a_cone_give_about_the_same_map() -> None:
     readings, p = corridor_drive(0).readings, Parameters()
     reference = Mapper(p).run(readings)
     maps = TiledMapper(p, 5.0).run(readings)
     best = reference.statistics['searched_objective']
     assert maps.statistics['searched_objective'] >= best - 0.001 * abs(best)
-    # walls are as many, with tiles or without
+    # the number of occupied cells is about the same with and without tiles
     walls = [int((m.ml == 1).sum()) for m in (maps, reference)]
     assert abs(walls[0] - walls[1]) < 0.02 * walls[1]
-    # and what is near a seam is as well explained as what is not
+    # readings near a seam are explained as well as others
     near = [np.abs((m.readings.x + 2.5) % 5.0 - 2.5) < 0.5 for m in (maps, reference)]
     share = [
         [float(m.unexplained[side].mean()) for side in (n, ~n)] for m, n in zip((maps, reference), near, strict=True)
@@ -234,7 +234,7 @@ def test_tiles_of_the_corridor_as_small_as_a_cone() -> None:
     assert share[0][0] - share[1][0] == pytest.approx(share[0][1] - share[1][1], abs=0.01)
 
 
-def test_it_can_be_cancelled_and_says_what_is_wrong() -> None:
+def test_tiled_mapper_can_be_cancelled_and_rejects_bad_input() -> None:
     mapper = TiledMapper(Parameters(), 3.0)
     with pytest.raises(Cancelled):
         mapper.run(tour(), lambda stage, progress: mapper.cancel() if stage == 'search' else None)
@@ -244,7 +244,7 @@ def test_it_can_be_cancelled_and_says_what_is_wrong() -> None:
         TiledMapper(Parameters(), 3.0).run(tour().select(slice(0, 0)))
 
 
-def test_what_is_known_of_a_tile_can_be_sent_to_a_process() -> None:
+def test_surroundings_of_a_tile_can_be_pickled() -> None:
     p = Parameters()
     made = with_normals(mosaic(tour(), p, 4.0), p)
     number = made.filled[len(made.filled) // 2]

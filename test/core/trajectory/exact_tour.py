@@ -1,4 +1,4 @@
-"""A drive whose odometry is right, and what walls say of it."""
+"""A drive with exact odometry, and its heading from walls."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from forward_grid_mapper.simulation.world import building_tour, building_world
 
 
 class Tour(NamedTuple):
-    """What a `Solver` takes."""
+    """The arguments of a `Solver`."""
 
     odometry: Odometry
     windows: Windows
@@ -30,9 +30,9 @@ class Tour(NamedTuple):
     heading: Heading
 
 
-def tour_with(sonars: SonarArray, way: NDArray[np.float64] | None = None) -> Tour:
-    """Return the beginning of the tour through the building, or another way."""
-    recording = drive(building_world(), building_tour()[:20] if way is None else way, 0.1, sonars, NOISY, seed=3)
+def tour_with(sonars: SonarArray, path: NDArray[np.float64] | None = None) -> Tour:
+    """Return the beginning of the tour through the building, or of another path."""
+    recording = drive(building_world(), building_tour()[:20] if path is None else path, 0.1, sonars, NOISY, seed=3)
     odometry = odometry_of(recording)
     windows = cut(recording.readings, odometry)
     scans = Scans(windows, for_matching(Parameters()), np.zeros(1, np.uint8), held_out(len(windows)))

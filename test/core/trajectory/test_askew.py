@@ -1,4 +1,4 @@
-"""Buildings in two parts that stand askew to each other: directions of walls are told from drift of the yaw."""
+"""Buildings with two parts at an angle: different directions of walls are not taken for drift of the yaw."""
 
 from __future__ import annotations
 
@@ -27,18 +27,18 @@ from forward_grid_mapper.simulation.world import Floorplan, World, building_tour
 KINK = math.radians(25.0)
 PIVOT = np.array([16.0, 5.0])
 LENGTH, HALF = 13.0, 1.0
-"""Metres: the length of each of both corridors, and half of their width."""
+"""Metres: the length of each of the two corridors, and half of their width."""
 
 
 def along(metres: float, aside: float = 0.0) -> np.ndarray:
-    """A place so far along the middle of both corridors, from the kink on, and to the left of it."""
+    """A place at this distance along the middle line of both corridors, from the kink on, and to the left of it."""
     angle = KINK if metres > 0.0 else 0.0
     c, s = math.cos(angle), math.sin(angle)
     return PIVOT + np.array([metres * c - aside * s, metres * s + aside * c])
 
 
 def kinked_world() -> World:
-    """Two corridors with a kink of 25° between them, with cupboards along their walls."""
+    """Two corridors with a kink of 25° between them, and cupboards along their walls."""
     plan = Floorplan('kink', 320, 160)
 
     def line(*places: np.ndarray) -> None:
@@ -75,12 +75,12 @@ def bent(exact: Recording) -> tuple[Recording, Odometry, Windows]:
 @pytest.fixture(scope='module')
 def found(bent: tuple[Recording, Odometry, Windows]) -> Heading:
     windows = bent[2]
-    heard = heading(windows, *wall_votes(windows, np.zeros(len(windows), bool)))
-    assert heard is not None
-    return heard
+    found_heading = heading(windows, *wall_votes(windows, np.zeros(len(windows), bool)))
+    assert found_heading is not None
+    return found_heading
 
 
-def test_the_second_part_is_found_with_its_direction(exact, bent, found) -> None:
+def test_second_direction_of_walls_is_found(exact, bent, found) -> None:
     windows = bent[2]
     x = odometry_of(exact).at(windows.node_stamp)[found.at, 0] - PIVOT[0]
     second = (
@@ -95,12 +95,12 @@ def test_the_second_part_is_found_with_its_direction(exact, bent, found) -> None
     assert abs(abs(math.remainder(angle, math.pi / 2)) - KINK) < math.radians(3.0)
 
 
-def test_the_heading_is_right_in_both_parts(exact, bent, found, monkeypatch) -> None:
+def test_heading_is_right_in_both_parts(exact, bent, found, monkeypatch) -> None:
     windows = bent[2]
 
-    def off(heard: Heading) -> float:
-        true = odometry_of(exact).at(windows.node_stamp)[heard.at, 2]
-        wrong = wrapped(windows.node[heard.at, 2] + heard.correction - true)
+    def off(found_heading: Heading) -> float:
+        true = odometry_of(exact).at(windows.node_stamp)[found_heading.at, 2]
+        wrong = wrapped(windows.node[found_heading.at, 2] + found_heading.correction - true)
         middle = math.atan2(np.sin(wrong).mean(), np.cos(wrong).mean())
         return float(np.degrees(np.sqrt((wrapped(wrong - middle) ** 2).mean())))
 
@@ -111,15 +111,15 @@ def test_the_heading_is_right_in_both_parts(exact, bent, found, monkeypatch) -> 
     assert off(alike) > 8.0
 
 
-def test_places_of_both_parts_measure_the_yaw(found) -> None:
+def test_yaw_is_measured_in_both_parts(found) -> None:
     for part in (found.wall_direction == 0.0, found.wall_direction != 0.0):
-        told = part & (found.information > 0.0)
-        assert told.sum() > 0.6 * part.sum()
-        off = np.degrees(wrapped(found.measured - found.correction))[told]
+        measured = part & (found.information > 0.0)
+        assert measured.sum() > 0.6 * part.sum()
+        off = np.degrees(wrapped(found.measured - found.correction))[measured]
         assert np.sqrt((off**2).mean()) < 2.0
 
 
-def test_a_node_has_the_direction_of_the_nearest_votes(bent, found) -> None:
+def test_node_has_the_direction_of_the_nearest_votes(bent, found) -> None:
     _, odometry, windows = bent
     scans = Scans(windows, Parameters(), np.zeros(1, np.uint8), held_out(len(windows)))
     solver = Solver(odometry, windows, scans, found, lambda stage: lambda part: None)
@@ -129,7 +129,7 @@ def test_a_node_has_the_direction_of_the_nearest_votes(bent, found) -> None:
 
 
 @pytest.mark.slow
-def test_a_drive_through_both_parts_is_refined(exact: Recording, bent: tuple[Recording, Odometry, Windows]) -> None:
+def test_drive_through_both_parts_is_refined(exact: Recording, bent: tuple[Recording, Odometry, Windows]) -> None:
     (recording, odometry, _), true = bent, odometry_of(exact)
     assert rms_after_alignment(odometry.pose, true.pose) > 1.0
     outcome = Refiner(Parameters()).run(recording.readings, odometry)
@@ -138,14 +138,14 @@ def test_a_drive_through_both_parts_is_refined(exact: Recording, bent: tuple[Rec
 
 
 @pytest.mark.slow
-def test_exact_odometry_stays_in_both_parts(exact: Recording) -> None:
+def test_exact_odometry_in_both_parts_is_kept(exact: Recording) -> None:
     outcome = Refiner(Parameters()).run(exact.readings, odometry_of(exact))
     assert not outcome.accepted
     assert outcome.readings is exact.readings
 
 
 @pytest.mark.parametrize('askew', [(0.0,), (0.0, 0.7), (0.0, 0.3, 1.1)])
-def test_votes_of_two_places_against_all_pairs_of_states(bent, askew: tuple[float, ...]) -> None:
+def test_beliefs_of_two_places_equal_a_sum_over_all_pairs_of_states(bent, askew: tuple[float, ...]) -> None:
     windows = bent[2]
     at, votes = wall_votes(windows, np.zeros(len(windows), bool))
     drifts = Drifts(0.01, 0.02, 0.05)
@@ -176,7 +176,7 @@ def test_votes_of_two_places_against_all_pairs_of_states(bent, askew: tuple[floa
         assert smooth[k] == pytest.approx(both[k] / both[k].sum(), abs=1e-12)
 
 
-def test_votes_for_walls_askew_are_those_of_a_robot_turned_back(bent) -> None:
+def test_votes_for_turned_walls_equal_those_of_a_robot_turned_back(bent) -> None:
     windows = bent[2]
     at, votes = wall_votes(windows, np.zeros(len(windows), bool))
     steps = 50
@@ -185,7 +185,7 @@ def test_votes_for_walls_askew_are_those_of_a_robot_turned_back(bent) -> None:
     assert DIRECTIONS * 2 == module.STATES
 
 
-def test_walls_askew_are_as_far_as_those_of_a_map_turned_back(bent) -> None:
+def test_distances_of_turned_walls_equal_those_of_a_map_turned_back(bent) -> None:
     windows = bent[2]
     nothing, angle = np.zeros(len(windows), bool), 0.4
     turned = compose(np.array([0.0, 0.0, angle]), windows.node)
@@ -200,15 +200,15 @@ def test_walls_askew_are_as_far_as_those_of_a_map_turned_back(bent) -> None:
 
 
 @pytest.mark.slow
-def test_drift_is_not_taken_for_another_part() -> None:
+def test_drift_gives_no_second_direction_of_walls() -> None:
     recording = drive(building_world(), building_tour(), 0.1, front_array(), NOISY, seed=3)
     drifting = with_drift(recording, LEVELS['wheels'], 2)
     windows = cut(drifting.readings, odometry_of(drifting))
-    heard = heading(windows, *wall_votes(windows, np.zeros(len(windows), bool)))
-    assert heard is not None and (heard.wall_direction == 0.0).all()
+    found_heading = heading(windows, *wall_votes(windows, np.zeros(len(windows), bool)))
+    assert found_heading is not None and (found_heading.wall_direction == 0.0).all()
 
 
-def test_a_wall_ends_where_another_part_begins(bent) -> None:
+def test_wall_ends_at_the_border_between_parts(bent) -> None:
     windows = bent[2]
     nothing, askew = np.zeros(len(windows), bool), np.zeros(len(windows))
     askew[len(windows) // 2 :] = 1e-12

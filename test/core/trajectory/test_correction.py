@@ -1,4 +1,4 @@
-"""What a trajectory makes of poses and readings, those after its end included; odometry that readings tell."""
+"""Corrections applied to poses and readings, also after the end of the trajectory; odometry recovered from readings."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def readings_at(rng: np.random.Generator, odometry: Odometry, stamp: np.ndarray)
 
 
 @pytest.mark.parametrize('seed', range(20))
-def test_readings_go_where_the_robot_was(seed: int) -> None:
+def test_corrected_readings_move_with_the_robot(seed: int) -> None:
     rng = np.random.default_rng(seed)
     odometry, other = some_odometry(rng, 50), some_odometry(rng, 50)
     trajectory = Odometry(odometry.stamp, other.pose)
@@ -43,7 +43,7 @@ def test_readings_go_where_the_robot_was(seed: int) -> None:
         assert np.array_equal(
             getattr(correction.apply(inner), name), getattr(replaced(inner, odometry, trajectory), name)
         )
-    # after the end, the transform of the end
+    # after the end, the transform is that of the end
     later = some_odometry(rng, 30)
     later = Odometry(later.stamp + odometry.stamp[-1], later.pose)
     outer = readings_at(rng, later, later.stamp[1:-1])
@@ -54,7 +54,7 @@ def test_readings_go_where_the_robot_was(seed: int) -> None:
     assert compose(correction.last, odometry.pose[-1])[:2] == pytest.approx(trajectory.pose[-1, :2])
     assert abs(wrapped(compose(correction.last, odometry.pose[-1])[2] - trajectory.pose[-1, 2])) < 1e-9
     assert correction.moved == pytest.approx(np.hypot(*(trajectory.pose[-1] - odometry.pose[-1])[:2]))
-    # what is not moved is not changed
+    # other columns are unchanged
     for name in ('z', 'stamp', 'sensor', 'half_angle'):
         assert np.array_equal(getattr(moved, name), getattr(outer, name))
     # a path of the same odometry at other stamps
@@ -65,14 +65,14 @@ def test_readings_go_where_the_robot_was(seed: int) -> None:
     assert np.abs(np.diff(along.pose[:, 2])).max(initial=0.0) <= np.pi
     beyond = correction.along(later).pose[later.stamp > odometry.stamp[-1]]
     assert beyond[:, :2] == pytest.approx(compose(correction.last, later.pose[later.stamp > odometry.stamp[-1]])[:, :2])
-    way = correction.path_of(np.r_[odometry.stamp, later.stamp], np.r_[odometry.pose, later.pose])
+    path = correction.path_of(np.r_[odometry.stamp, later.stamp], np.r_[odometry.pose, later.pose])
     at_end = int((later.stamp <= odometry.stamp[-1]).sum())
-    assert len(way) == 80 - at_end
-    assert way[50:] == pytest.approx(compose(correction.last, later.pose[at_end:])[:, :2])
+    assert len(path) == 80 - at_end
+    assert path[50:] == pytest.approx(compose(correction.last, later.pose[at_end:])[:, :2])
 
 
 @pytest.mark.parametrize('seed', range(20))
-def test_readings_tell_the_odometry_that_is_gone(seed: int) -> None:
+def test_missing_odometry_is_recovered_from_readings(seed: int) -> None:
     rng = np.random.default_rng(seed)
     odometry = some_odometry(rng, 60)
     readings = readings_at(rng, odometry, rng.permutation(odometry.stamp))
@@ -83,7 +83,7 @@ def test_readings_tell_the_odometry_that_is_gone(seed: int) -> None:
     assert np.abs(wrapped(whole.pose[:, 2] - odometry.pose[:, 2])).max() < 1e-9
     nothing = Odometry.of(np.zeros(0, np.int64), np.zeros((0, 3)))
     assert np.array_equal(recovered(nothing, readings, MOUNTS).stamp, odometry.stamp)
-    # of sensors whose place nobody knows nothing can be told
+    # sensors with unknown pose give no odometry
     only = recovered(late, readings, {'left': MOUNTS['left']})
     assert set(only.stamp[: -len(late.stamp)]) == set(readings.stamp[readings.sensor == 0]) - set(late.stamp)
     assert recovered(late, readings, {}) is late
@@ -91,7 +91,7 @@ def test_readings_tell_the_odometry_that_is_gone(seed: int) -> None:
 
 
 @pytest.mark.parametrize('seed', range(10))
-def test_a_correction_goes_on_after_its_end_and_can_be_cut_off(seed: int) -> None:
+def test_correction_is_extended_and_cut_off(seed: int) -> None:
     rng = np.random.default_rng(seed)
     odometry, other = some_odometry(rng, 60), some_odometry(rng, 60)
     begin, end = sorted(rng.integers(1, 59, 2).tolist())
@@ -99,7 +99,7 @@ def test_a_correction_goes_on_after_its_end_and_can_be_cut_off(seed: int) -> Non
         Odometry(odometry.stamp[: end + 1], odometry.pose[: end + 1]),
         Odometry(odometry.stamp[: end + 1], other.pose[: end + 1]),
     )
-    # what comes overlaps, and what was there stays
+    # new poses overlap, and old ones stay
     later = slice(begin, None)
     moved = Odometry(odometry.stamp[later], other.pose[later] + 1.0)
     longer = first.continued(Odometry(odometry.stamp[later], odometry.pose[later]), moved)

@@ -1,4 +1,4 @@
-"""Following: better than keeping the correction, the same in any portions, and never against what is predicted."""
+"""Following: better than the last correction, independent of portions, and never against predicted readings."""
 
 from __future__ import annotations
 
@@ -25,11 +25,11 @@ from forward_grid_mapper.simulation.sonar import NOISY, sonar_ring
 from forward_grid_mapper.simulation.world import building_tour, building_world
 
 KNOWN = 10.0
-"""Metres of the drive whose trajectory is given."""
+"""Metres of the drive with known trajectory."""
 
 
 class Sample:
-    """A drive of 25 m whose odometry drifts, and whose trajectory is known for the first ten."""
+    """A drive of 25 m with odometry that drifts; the trajectory of the first ten metres is known."""
 
     def __init__(self) -> None:
         exact = drive(building_world(), building_tour()[:10], 0.15, sonar_ring(16), NOISY, seed=3)
@@ -41,12 +41,12 @@ class Sample:
         self.correction = Correction(Odometry(stamp, self.odometry.pose[begun]), Odometry(stamp, self.true.pose[begun]))
 
     def off(self, correction: Correction) -> np.ndarray:
-        """Metres by which the poses after the known ones are off, as they are said to be in the end."""
-        said = correction.extended(self.odometry.stamp, self.odometry.pose).pose
-        return np.hypot(*(said - self.true.pose)[self.known :, :2].T)
+        """Errors in metres of the poses after the known ones, with the final correction."""
+        corrected = correction.extended(self.odometry.stamp, self.odometry.pose).pose
+        return np.hypot(*(corrected - self.true.pose)[self.known :, :2].T)
 
     def until(self, stamp: int) -> tuple[Readings, Odometry]:
-        """What has come when the newest reading has this stamp."""
+        """The input until the newest reading has this stamp."""
         o = self.odometry
         end = int(np.searchsorted(o.stamp, stamp, side='right'))
         return self.readings.select(self.readings.stamp <= stamp), Odometry(o.stamp[:end], o.pose[:end])
@@ -68,15 +68,15 @@ def followed(sample: Sample) -> Follower:
     return follower
 
 
-def test_without_right_angles_walls_have_no_say(sample: Sample, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_without_right_angles_walls_are_not_used(sample: Sample, monkeypatch: pytest.MonkeyPatch) -> None:
     follower = Follower(sample.correction, {}, Parameters(), right_angles=False)
     graphs = []
 
     def graph(self: Follower, *rest: Any) -> Any:
-        graphs.append(asked(self, *rest))
+        graphs.append(original(self, *rest))
         return graphs[-1]
 
-    asked = Follower._graph
+    original = Follower._graph
     monkeypatch.setattr(Follower, '_graph', graph)
     follower.follow(sample.readings, sample.odometry)
     assert follower.windows > 20
@@ -91,7 +91,7 @@ def same(one: Correction, other: Correction) -> bool:
     )
 
 
-def test_it_is_better_than_keeping_the_correction(sample: Sample, followed: Follower) -> None:
+def test_following_is_better_than_the_last_correction(sample: Sample, followed: Follower) -> None:
     kept, ours = sample.off(sample.correction), sample.off(followed.correction)
     assert np.sqrt((kept**2).mean()) > 0.5
     assert np.sqrt((ours**2).mean()) < 0.15
@@ -103,7 +103,7 @@ def test_it_is_better_than_keeping_the_correction(sample: Sample, followed: Foll
     assert not followed.obstacle
 
 
-def test_what_was_found_as_a_whole_stays_and_nothing_is_left_out(sample: Sample, followed: Follower) -> None:
+def test_known_trajectory_stays_and_all_poses_are_corrected(sample: Sample, followed: Follower) -> None:
     correction, count = followed.correction, sample.known + 1
     assert np.array_equal(correction.trajectory.pose[:count], sample.true.pose[:count])
     stamp = correction.trajectory.stamp
@@ -118,7 +118,7 @@ def test_what_was_found_as_a_whole_stays_and_nothing_is_left_out(sample: Sample,
 @pytest.mark.parametrize(
     'every', [pytest.param(1, marks=pytest.mark.slow), 7, pytest.param(150, marks=pytest.mark.slow)]
 )
-def test_portions_do_not_matter(sample: Sample, followed: Follower, every: int) -> None:
+def test_result_does_not_depend_on_portions(sample: Sample, followed: Follower, every: int) -> None:
     stamps = sample.odometry.stamp[sample.known :: every]
     follower, changes = follower_of(sample), 0
     for stamp in [*stamps.tolist(), int(sample.readings.stamp.max())]:
@@ -128,13 +128,13 @@ def test_portions_do_not_matter(sample: Sample, followed: Follower, every: int) 
     assert same(follower.correction, followed.correction)
 
 
-def test_readings_may_come_out_of_order(sample: Sample) -> None:
+def test_result_does_not_depend_on_the_order_of_readings(sample: Sample) -> None:
     half = int(sample.odometry.stamp[(sample.known + len(sample.odometry.stamp)) // 2])
     straight, shuffled = follower_of(sample), follower_of(sample)
     readings, odometry = sample.until(half)
     order = np.argsort(readings.stamp + np.random.default_rng(1).integers(0, LATE, len(readings)))
     straight.follow(readings, odometry)
-    # those that are late are there a fifth of a second later
+    # late readings are there a fifth of a second later
     early = readings.select(order[: len(order) - 40])
     shuffled.follow(early, odometry)
     shuffled.follow(readings.select(order), odometry)
@@ -142,30 +142,30 @@ def test_readings_may_come_out_of_order(sample: Sample) -> None:
     assert same(straight.correction, shuffled.correction)
 
 
-def test_it_waits_for_whole_windows_and_their_readings(sample: Sample) -> None:
+def test_following_waits_for_complete_windows(sample: Sample) -> None:
     follower = follower_of(sample)
     assert not follower.follow(*sample.until(sample.correction.end))
     assert follower.correction is sample.correction
     readings, _ = sample.until(sample.correction.end)
-    # odometry alone is not enough
+    # odometry without readings is not sufficient
     assert not follower.follow(readings, sample.odometry)
     assert follower.windows == 0
     assert follower.follow(sample.readings, sample.odometry)
 
 
-def test_calibration_is_applied(sample: Sample, monkeypatch: pytest.MonkeyPatch) -> None:
-    # without echoes there is nothing else, and nothing to judge by
+def test_calibration_corrects_odometry_without_echoes(sample: Sample, monkeypatch: pytest.MonkeyPatch) -> None:
+    # without echoes, only the calibration corrects odometry
     monkeypatch.setattr(Follower, '_judge', lambda self, *_: None)
-    deaf = replace(sample.readings, z=sample.readings.z_max)
+    without_echoes = replace(sample.readings, z=sample.readings.z_max)
     ends = []
     for calibration in ({}, {'bias': 0.05}, {'scale': 0.1}):
         follower = Follower(sample.correction, calibration, Parameters())
-        assert follower.follow(deaf, sample.odometry)
+        assert follower.follow(without_echoes, sample.odometry)
         ends.append(follower.correction)
     plain, turned, longer = ends
-    # settled nodes lie where the trajectory was, and from there on odometry goes on
-    said, kept = sample.off(plain), sample.off(sample.correction)
-    assert abs(said[: len(kept)] - kept).max() < 0.3
+    # settled nodes have the poses of the trajectory, and odometry continues from there
+    found, kept = sample.off(plain), sample.off(sample.correction)
+    assert abs(found[: len(kept)] - kept).max() < 0.3
     way = plain.trajectory.travel[-1] - plain.trajectory.travel[sample.known]
     off = turned.trajectory.pose[-1, 2] - plain.trajectory.pose[-1, 2]
     assert off == pytest.approx(0.05 * way, rel=0.1)
@@ -173,7 +173,7 @@ def test_calibration_is_applied(sample: Sample, monkeypatch: pytest.MonkeyPatch)
     assert more == pytest.approx(1.1 * way, rel=0.03)
 
 
-def test_a_jump_of_odometry_ends_it(sample: Sample) -> None:
+def test_jump_of_odometry_ends_following(sample: Sample) -> None:
     o = sample.odometry
     pose, at = o.pose.copy(), (sample.known + len(o.stamp)) // 2
     pose[at:, 0] += 3.0
@@ -186,7 +186,7 @@ def test_a_jump_of_odometry_ends_it(sample: Sample) -> None:
     assert follower.correction is before
 
 
-def test_it_can_be_cancelled(sample: Sample) -> None:
+def test_following_can_be_cancelled(sample: Sample) -> None:
     follower = follower_of(sample)
     follower.cancel()
     with pytest.raises(Cancelled):
@@ -194,8 +194,8 @@ def test_it_can_be_cancelled(sample: Sample) -> None:
     assert follower.correction is sample.correction
 
 
-def test_what_predicts_worse_is_not_in_force(sample: Sample, monkeypatch: pytest.MonkeyPatch) -> None:
-    # walls that lead astray: they turn the robot by 0.1 rad more from place to place
+def test_correction_that_predicts_worse_is_not_used(sample: Sample, monkeypatch: pytest.MonkeyPatch) -> None:
+    # wrong walls: they turn the robot by 0.1 rad more from place to place
     real = following.yaws_of_votes
 
     def astray(votes: Any, yaw: Any, correction: Any) -> Any:
@@ -210,11 +210,9 @@ def test_what_predicts_worse_is_not_in_force(sample: Sample, monkeypatch: pytest
     assert follower.correction is sample.correction
 
 
-def test_the_correction_that_has_proved_itself_is_the_one_to_keep(
-    sample: Sample, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    said = [0.1 + 0.01 * (k % 2) for k in range(6)] + [-0.2 - 0.01 * (k % 2) for k in range(6)] + [0.5] * 20
-    ours = iter(said)
+def test_last_proven_correction_is_used(sample: Sample, monkeypatch: pytest.MonkeyPatch) -> None:
+    gains = [0.1 + 0.01 * (k % 2) for k in range(6)] + [-0.2 - 0.01 * (k % 2) for k in range(6)] + [0.5] * 20
+    ours = iter(gains)
     monkeypatch.setattr(
         Follower, '_judge', lambda self, *_: setattr(self, '_gains', [*self._gains, next(ours)][-following.JUDGED :])
     )
@@ -233,7 +231,7 @@ def test_the_correction_that_has_proved_itself_is_the_one_to_keep(
 
 
 @pytest.mark.parametrize('angle', [0.0, 0.3, -0.7, 2.0])
-def test_the_direction_of_walls_turns_with_the_map(sample: Sample, angle: float) -> None:
+def test_direction_of_walls_turns_with_the_map(sample: Sample, angle: float) -> None:
     readings, odometry = sample.until(sample.correction.end)
     windows = cut(readings, odometry)
     nodes = compose(np.array([1.0, -2.0, angle]), sample.correction.trajectory.at(windows.node_stamp))
@@ -241,7 +239,7 @@ def test_the_direction_of_walls_turns_with_the_map(sample: Sample, angle: float)
     assert abs(off) < math.radians(1.0)
 
 
-def test_a_map_that_is_turned_is_followed_alike(sample: Sample, followed: Follower) -> None:
+def test_following_on_a_turned_map_gives_the_turned_result(sample: Sample, followed: Follower) -> None:
     turn = np.array([3.0, -1.0, 0.4])
     base = sample.correction
     turned = Correction(base.odometry, Odometry(base.trajectory.stamp, compose(turn, base.trajectory.pose)))
@@ -252,15 +250,15 @@ def test_a_map_that_is_turned_is_followed_alike(sample: Sample, followed: Follow
 
 
 @pytest.mark.slow
-def test_places_are_recognised_in_what_was_mapped_before(sample: Sample, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The robot turns around and drives back, and nothing but places tells that the wheels are said to be too small."""
+def test_places_on_the_earlier_map_are_recognised(sample: Sample, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The robot turns and drives back; only recognised places show that the stated size of the wheels is too small."""
     there, path = replaced_by_truth(sample), sample.true
     end, pause = int(path.stamp[-1]), 10**9
     back = path.pose[::-1] + np.array([0.0, 0.0, math.pi])
     stamp = end + pause + (end - path.stamp)[::-1]
     back_path = Odometry.of(stamp, back)
     whole = Odometry.of(np.concatenate([path.stamp, stamp]), np.concatenate([path.pose, back_path.pose]))
-    # a ring of sonars sees the same when it has turned by half, each by the one across
+    # a ring of sonars sees the same after half a turn, each sonar as the opposite one
     across = {name: k for k, name in enumerate(there.sensor_names)}
     assert len(across) == 16
     sensor = (there.sensor + 8) % 16
@@ -275,7 +273,7 @@ def test_places_are_recognised_in_what_was_mapped_before(sample: Sample, monkeyp
             monkeypatch.setattr(Follower, '_recognised', lambda self, *_: no_edges())
         follower.follow(both, whole)
         assert (follower.places > 3) == recognises
-        # what is followed, whether it is in force or not
+        # the correction that is followed, whether it is used or not
         path_now = follower._followed.trajectory
         drifts.append(np.hypot(*(path_now.pose - whole.at(path_now.stamp))[:, :2].T).max())
     assert drifts[0] < 0.3
@@ -291,8 +289,8 @@ def replaced_by_truth(sample: Sample) -> Readings:
 
 
 @pytest.mark.parametrize('seed', range(10))
-def test_places_stay_where_they_are_when_the_tail_is_shifted(seed: int) -> None:
-    """Their residuals, and what these count, are the same in the frame of another first node."""
+def test_recognised_places_stay_when_the_graph_is_shifted(seed: int) -> None:
+    """Residuals and their weights are the same in the frame of another first node."""
     rng = np.random.default_rng(seed)
     old, new, node = rng.normal(0.0, 3.0, (3, 3))
     measured = relative(old, node) + rng.normal(0.0, 0.05, 3)
@@ -312,7 +310,7 @@ def test_places_stay_where_they_are_when_the_tail_is_shifted(seed: int) -> None:
     assert axes_at(0.0) == pytest.approx(np.eye(3))
 
 
-def test_odometry_from_a_window_on_has_the_same_windows(sample: Sample) -> None:
+def test_windows_from_a_later_begin_are_the_same(sample: Sample) -> None:
     for begin in (0, 1, 7, 20):
         rest = following._from_step(sample.odometry, begin)
         whole, ours = following._window_coordinate(sample.odometry), following._window_coordinate(rest)
@@ -323,7 +321,7 @@ def test_odometry_from_a_window_on_has_the_same_windows(sample: Sample) -> None:
         assert one.node == pytest.approx(other.node[begin:], abs=1e-6)
 
 
-def test_nothing_is_compiled_while_it_follows(sample: Sample) -> None:
+def test_following_compiles_no_kernels(sample: Sample) -> None:
     warm_up.warm_up_trajectory()
     kernels = [walls.count_votes, likelihood.score_poses, likelihood._set_unknown]
     before = [len(kernel.signatures) for kernel in kernels]

@@ -1,4 +1,4 @@
-"""Walls and the heading: votes against plain Python, and yaws that are known."""
+"""Walls and the heading: votes compared with plain Python, and drives with known yaw."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ def bent(tour: Recording) -> tuple[Recording, Odometry, Windows]:
     return recording, odometry, cut(recording.readings, odometry)
 
 
-def test_votes_are_those_of_plain_python() -> None:
+def test_votes_are_those_of_the_twin() -> None:
     rng = np.random.default_rng(0)
     echoes = np.column_stack(
         [rng.normal(0, 1, (60, 2)), rng.uniform(-4, 4, 60), rng.choice([0.13, 0.3], 60), rng.uniform(0.3, 3, 60)]
@@ -61,7 +61,7 @@ def test_votes_are_those_of_plain_python() -> None:
         angle, bins = math.radians(degree), {}
         even = 0.0
         for x, y, bearing, half, z, right, left in echoes:
-            # to the left of the cone it is positive
+            # positive to the left of the cone
             off = wrapped(angle - bearing)
             edge = min(max(off, -half), half)
             if -half - right <= off <= half + left:
@@ -86,7 +86,7 @@ def test_votes_are_those_of_plain_python() -> None:
 
 
 def echoes_along_a_way(touched) -> np.ndarray:
-    """Return the echoes of 16 sensors along 3 m, where `touched` gives bearing and range of what is heard."""
+    """Return the echoes of 16 sensors along 3 m; `touched` returns bearing and range of an echo."""
     rows = []
     for x in np.arange(-1.5, 1.5, 0.1):
         bearing, z = touched(x)
@@ -95,7 +95,7 @@ def echoes_along_a_way(touched) -> np.ndarray:
     return np.array(rows)
 
 
-def test_a_wall_is_voted_for_and_a_post_is_not() -> None:
+def test_wall_gets_votes_and_a_post_does_not() -> None:
     votes = np.empty((2, DIRECTIONS))
     count_votes(echoes_along_a_way(lambda x: (math.pi / 2, 1.2)), np.empty((BINS, 4)), votes[0])
     count_votes(
@@ -107,7 +107,7 @@ def test_a_wall_is_voted_for_and_a_post_is_not() -> None:
     assert votes[1].max() < 0.05 * votes[0].max()
 
 
-def test_random_ranges_vote_for_nothing_much() -> None:
+def test_random_ranges_give_few_votes() -> None:
     rng = np.random.default_rng(0)
     sensors = np.radians([-90, -50, -30, -10, 10, 30, 50, 90])
     x, bearing = (grid.ravel() for grid in np.meshgrid(np.arange(-1.5, 1.5, 0.1), sensors))
@@ -124,12 +124,12 @@ def in_degrees(bearings, half: float) -> list[list[float]]:
     return np.degrees(beside(np.radians(bearings), np.full(len(bearings), math.radians(half)))).tolist()
 
 
-def test_cones_reach_as_far_as_no_other_does_if_none_looks_to_a_side() -> None:
-    # of eight at equal angles, none straight ahead, each has a gap of 30 degrees on either side
+def test_gaps_beside_cones_without_a_sensor_to_the_side() -> None:
+    # eight cones at equal angles, none straight ahead: each has a gap of 30 degrees on both sides
     eighths = np.arange(-157.5, 180.0, 45.0)
     assert in_degrees(eighths, 7.4) == pytest.approx(np.full((8, 2), 30.0))
     assert in_degrees(eighths, 17.4) == pytest.approx(np.full((8, 2), 10.0))
-    # right of one that looks 20 degrees to the right there is nothing, between the two there are 10 degrees
+    # to the right of the cone at 20 degrees right there is none; between the two there are 10 degrees
     assert (
         in_degrees([-20.0, 0.0, 0.0], 4.9)
         == [[pytest.approx(30.0), pytest.approx(10.0)]] + [[pytest.approx(10.0), pytest.approx(30.0)]] * 2
@@ -137,25 +137,25 @@ def test_cones_reach_as_far_as_no_other_does_if_none_looks_to_a_side() -> None:
 
 
 @pytest.mark.parametrize(('bearing', 'to_a_side'), [(97.0, False), (95.0, True), (-95.0, True), (265.0, True)])
-def test_a_cone_that_holds_what_is_straight_to_a_side_is_enough(bearing: float, to_a_side: bool) -> None:
+def test_cone_that_contains_the_direction_to_a_side_has_no_gap(bearing: float, to_a_side: bool) -> None:
     assert (in_degrees([bearing, 0.0], 9.0) == [[0.0, 0.0]] * 2) == to_a_side
 
 
-def test_many_cones_as_of_a_sensor_that_turns_on_the_robot_take_little_memory() -> None:
+def test_gaps_of_many_cones_take_little_memory() -> None:
     bearings = np.radians(np.linspace(-75.0, 75.0, 20_000))
     tracemalloc.start()
     past = np.degrees(beside(bearings, np.full(len(bearings), math.radians(8.0))))
     most = tracemalloc.get_traced_memory()[1]
     tracemalloc.stop()
     assert most < 30e6
-    # right of the rightmost and left of the leftmost
+    # to the right of the rightmost and to the left of the leftmost cone
     assert past[0] == pytest.approx([30.0, 0.0]) and past[-1] == pytest.approx([0.0, 30.0])
     assert past[5000:-5000].max() == 0.0
 
 
 @pytest.mark.parametrize('side', [1.0, -1.0])
-def test_a_wall_beside_which_all_cones_look_is_voted_for(side: float) -> None:
-    # 1.2 m away, and first met by the edge of the cone that looks 67.5 degrees to its side
+def test_wall_at_the_edge_of_all_cones_gets_votes(side: float) -> None:
+    # 1.2 m away, at first seen by the edge of the cone at 67.5 degrees to its side
     bearings, half = np.radians(np.arange(-157.5, 180.0, 45.0)), math.radians(7.5)
     slant = math.radians(15.0)
     x = np.arange(-1.5, 1.5, 0.1)
@@ -168,19 +168,19 @@ def test_a_wall_beside_which_all_cones_look_is_voted_for(side: float) -> None:
     assert votes[0, 0] > 3 * votes[1].max()
 
 
-def test_windows_hold_every_reading_once(bent) -> None:
+def test_windows_contain_each_reading_once(bent) -> None:
     recording, odometry, windows = bent
     assert windows.first[0] == 0
     assert windows.first[-1] == len(windows.readings) <= len(recording.readings)
     assert (np.diff(windows.first) >= 0).all()
     assert (np.diff(windows.node_progress) > 0).all()
-    # where nothing is corrected, nothing moves
+    # without correction, the poses are unchanged
     same = corrected(windows.progress, windows.robot, windows.node_progress, windows.node, windows.node)
     assert same == pytest.approx(windows.robot)
     assert odometry.travel[-1] == pytest.approx(windows.travel[-1], abs=1.5)
 
 
-def test_the_heading_is_found_where_odometry_drifts(bent, true) -> None:
+def test_heading_is_found_if_odometry_drifts(bent, true) -> None:
     _, _, windows = bent
     at, votes = wall_votes(windows, np.zeros(len(windows), bool))
     found = heading(windows, at, votes)
@@ -194,7 +194,7 @@ def test_the_heading_is_found_where_odometry_drifts(bent, true) -> None:
     assert found.over_odometry > 20
 
 
-def test_a_vote_is_a_likelihood(bent) -> None:
+def test_votes_are_likelihoods(bent) -> None:
     _, _, windows = bent
     at, votes = wall_votes(windows, np.zeros(len(windows), bool))
     chain = module._Chain(windows, at[:3], votes[:3])
@@ -208,7 +208,7 @@ def test_a_vote_is_a_likelihood(bent) -> None:
             assert chain.likelihood[k, 0, state] == pytest.approx(wanted)
 
 
-def test_noise_that_is_told_is_not_looked_for(bent) -> None:
+def test_given_noise_is_not_estimated(bent) -> None:
     _, _, windows = bent
     at, votes = wall_votes(windows, np.zeros(len(windows), bool))
     found = heading(windows, at, votes, (0.055,))
@@ -217,14 +217,14 @@ def test_noise_that_is_told_is_not_looked_for(bent) -> None:
     assert heading(windows, at, votes).drifts.noise in NOISES
 
 
-def test_exact_odometry_is_likelier_than_any_drift(tour, true) -> None:
+def test_exact_odometry_is_more_likely_than_any_drift(tour, true) -> None:
     windows = cut(tour.readings, true)
     found = heading(windows, *wall_votes(windows, np.zeros(len(windows), bool)))
     assert found is not None
     assert found.over_odometry < 0
 
 
-def test_votes_that_agree_on_nothing_say_nothing(bent) -> None:
+def test_contradictory_votes_give_no_heading(bent) -> None:
     _, _, windows = bent
     at, votes = wall_votes(windows, np.zeros(len(windows), bool))
     rng = np.random.default_rng(1)
@@ -235,13 +235,13 @@ def test_votes_that_agree_on_nothing_say_nothing(bent) -> None:
     assert LEAST_GAIN > 0
 
 
-def test_windows_held_out_do_not_vote(bent) -> None:
+def test_held_out_windows_do_not_vote(bent) -> None:
     _, _, windows = bent
     _, votes = wall_votes(windows, np.ones(len(windows), bool))
     assert (votes == 1).all()
 
 
-def test_calibration_takes_out_what_is_systematic() -> None:
+def test_calibration_corrects_systematic_errors() -> None:
     t = np.linspace(0, 40, 400)
     right = np.column_stack([3 * np.sin(t / 5), 2 * np.cos(t / 7), np.zeros(400)])
     steps = np.diff(right[:, :2], axis=0)
@@ -250,13 +250,13 @@ def test_calibration_takes_out_what_is_systematic() -> None:
     wrong = np.array([0.04, 0.02, 0.05, -0.03])
     there = calibrated(odometry, wrong)
     assert np.abs(there.pose - odometry.pose).max() > 0.3
-    # to first order, the opposite calibration takes it back
+    # to first order, the opposite calibration undoes it
     small = wrong / 100
     back = calibrated(calibrated(odometry, small), -small)
     assert back.pose == pytest.approx(odometry.pose, abs=2e-3)
 
 
-def test_sensitivity_is_the_change_of_motions(bent) -> None:
+def test_sensitivity_is_the_derivative_of_motions(bent) -> None:
     _, odometry, windows = bent
     change = sensitivity(odometry, windows)
     c = np.array([2e-3, -1e-3, 1e-3, 3e-3])
@@ -264,7 +264,7 @@ def test_sensitivity_is_the_change_of_motions(bent) -> None:
     assert change @ c == pytest.approx(wanted, abs=2e-5)
 
 
-def test_a_turned_drive_is_turned() -> None:
+def test_drive_with_another_yaw_is_turned() -> None:
     line = np.column_stack([np.linspace(0, 5, 50), np.zeros(50), np.zeros(50)])
     odometry = Odometry.of(np.arange(50) * 10**8, line)
     turned = with_yaw(odometry, np.array([0.0, 5.0]), np.full(2, math.pi / 2))

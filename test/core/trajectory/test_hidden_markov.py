@@ -1,4 +1,4 @@
-"""Forward and backward passes against sums over all sequences of states."""
+"""Forward and backward passes, compared with sums over all sequences of states."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from forward_grid_mapper.core.trajectory.hidden_markov import forward, move, smo
 
 
 def sequences(likelihood: np.ndarray, densities: np.ndarray, others: np.ndarray, start: np.ndarray):
-    """Yield each sequence of (kind, value), and its probability together with that of all votes."""
+    """Yield each sequence of (kind, value) and its probability together with all votes."""
     places, kinds, size = likelihood.shape
     for states in itertools.product(itertools.product(range(kinds), range(size)), repeat=places):
         (kind, value) = states[0]
@@ -27,7 +27,7 @@ def sequences(likelihood: np.ndarray, densities: np.ndarray, others: np.ndarray,
 
 @settings(max_examples=40, deadline=None)
 @given(st.integers(0, 2**32 - 1), st.sampled_from([(4, 1, 4), (3, 2, 3), (1, 2, 5), (5, 1, 3)]), st.booleans())
-def test_they_are_sums_over_all_sequences(seed: int, shape: tuple[int, int, int], stays: bool) -> None:
+def test_passes_equal_sums_over_all_sequences(seed: int, shape: tuple[int, int, int], stays: bool) -> None:
     rng = np.random.default_rng(seed)
     places, _, size = shape
     likelihood, densities, start = rng.random(shape), rng.random((places - 1, size)), rng.random(size)
@@ -38,16 +38,16 @@ def test_they_are_sums_over_all_sequences(seed: int, shape: tuple[int, int, int]
         total += p
         for k, (kind, value) in enumerate(states):
             marginals[k, kind, value] += p
-    said, _ = forward(likelihood, densities, others, start)
-    assert said == pytest.approx(math.log(total), abs=1e-9)
+    log_likelihood, _ = forward(likelihood, densities, others, start)
+    assert log_likelihood == pytest.approx(math.log(total), abs=1e-9)
     again, beliefs = forward(likelihood, densities, others, start, keep=True)
-    assert again == said
+    assert again == log_likelihood
     assert beliefs[-1] == pytest.approx(marginals[-1] / total, abs=1e-12)
-    told = smooth(likelihood, densities, others, start)
-    assert told == pytest.approx(marginals / total, abs=1e-12)
+    smoothed = smooth(likelihood, densities, others, start)
+    assert smoothed == pytest.approx(marginals / total, abs=1e-12)
 
 
-def test_votes_that_contradict_the_motion_are_followed_all_the_same() -> None:
+def test_certain_votes_override_the_motion() -> None:
     likelihood = np.zeros((2, 1, 8))
     likelihood[0, 0, 0] = likelihood[1, 0, 5] = 1.0
     still = np.zeros((1, 8))
@@ -56,7 +56,7 @@ def test_votes_that_contradict_the_motion_are_followed_all_the_same() -> None:
     assert beliefs[1, 0, 5] == 1.0
 
 
-def test_a_motion_by_a_step_is_a_step_around_the_circle() -> None:
+def test_motion_by_one_step_shifts_the_circle() -> None:
     belief, density, out = np.array([[0.1, 0.2, 0.7]]), np.array([0.0, 1.0, 0.0]), np.empty((1, 3))
     move(belief, density, 0.0, out)
     assert out.tolist() == [[0.7, 0.1, 0.2]]

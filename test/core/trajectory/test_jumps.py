@@ -1,4 +1,4 @@
-"""Odometry that jumps: the drive goes on where the robot stood if readings say so; where they do not, that is said."""
+"""Jumps of odometry: the drive continues where the robot stood if readings fit there, otherwise a warning is given."""
 
 from __future__ import annotations
 
@@ -25,16 +25,16 @@ from forward_grid_mapper.simulation.world import building_tour, building_world
 
 
 def moved(readings: Readings, before: Odometry, after: Odometry) -> Readings:
-    """Readings of a drive as other odometry places them."""
+    """Readings of a drive, placed with other odometry."""
     sensors = np.stack([readings.x, readings.y, readings.yaw], 1)
     x, y, yaw = compose(after.at(readings.stamp), relative(before.at(readings.stamp), sensors)).T
     return replace(readings, x=x.copy(), y=y.copy(), yaw=yaw.copy())
 
 
-def begun_anew(
+def restarted(
     readings: Readings, odometry: Odometry, part: float, at: tuple[float, float, float] = (0.0, 0.0, 0.0)
 ) -> tuple[Readings, Odometry]:
-    """The same drive, whose odometry begins anew at a pose after a part of it."""
+    """The drive with odometry that restarts at this pose after a part of it."""
     first = int(part * len(odometry.stamp))
     pose = odometry.pose.copy()
     pose[first:] = compose(np.array(at), relative(odometry.pose[first], odometry.pose[first:]))
@@ -43,7 +43,7 @@ def begun_anew(
 
 
 def without_messages(readings: Readings, odometry: Odometry, seconds: float) -> tuple[Readings, Odometry]:
-    """The same drive with a gap in its messages."""
+    """The drive with a gap in its messages."""
     middle = int(odometry.stamp[len(odometry.stamp) // 2])
     gone = (odometry.stamp > middle) & (odometry.stamp < middle + seconds * 1e9)
     unread = (readings.stamp > middle) & (readings.stamp < middle + seconds * 1e9)
@@ -51,7 +51,7 @@ def without_messages(readings: Readings, odometry: Odometry, seconds: float) -> 
 
 
 def turning_at_once(readings: Readings, odometry: Odometry, true: Odometry) -> tuple[Readings, Odometry]:
-    """The same drive of a simulated robot that turns on the spot from one message to the next."""
+    """The drive of a simulated robot that turns on the spot from one message to the next."""
     since = odometry.stamp - odometry.stamp[0]
     still = np.hypot(*np.diff(true.pose[:, :2], axis=0).T) < 1e-6
     inside = np.append(still[:-1] & still[1:], False)
@@ -76,7 +76,7 @@ def bent(exact: Recording) -> tuple[Readings, Odometry]:
 
 @pytest.fixture(scope='module')
 def outcome(bent: tuple[Readings, Odometry]) -> tuple[Readings, Odometry, Refinement]:
-    readings, odometry = begun_anew(*bent, 0.5)
+    readings, odometry = restarted(*bent, 0.5)
     return readings, odometry, Refiner(Parameters()).run(readings, odometry)
 
 
@@ -85,20 +85,20 @@ def off(exact: Recording, path: Odometry) -> float:
 
 
 def with_few_poses(readings: Readings, odometry: Odometry, metres: float) -> tuple[Readings, Odometry]:
-    """The same drive with odometry that comes only so often."""
+    """The drive with odometry only once in so many metres."""
     travel, stay = odometry.travel, [0]
     for k in range(1, len(travel)):
         if travel[k] - travel[stay[-1]] >= metres or k == len(travel) - 1:
             stay.append(k)
-    seldom = Odometry.of(odometry.stamp[stay], odometry.pose[stay])
-    return moved(readings, odometry, seldom), seldom
+    sparse = Odometry.of(odometry.stamp[stay], odometry.pose[stay])
+    return moved(readings, odometry, sparse), sparse
 
 
-def test_poses_may_be_more_than_a_metre_apart(bent: tuple[Readings, Odometry]) -> None:
+def test_poses_more_than_a_metre_apart_are_no_jumps(bent: tuple[Readings, Odometry]) -> None:
     _, odometry = with_few_poses(*bent, 1.1)
     assert np.median(np.hypot(*np.diff(odometry.pose[:, :2], axis=0).T)) > 1.0
     assert not len(jumps(odometry)) and not len(doubtful_steps(odometry))
-    # nor is it a jump where the robot stood in between
+    # no jump either after a pause of the robot
     stamp = odometry.stamp.copy()
     stamp[10:] += 60_000_000_000
     assert not len(jumps(Odometry.of(stamp, odometry.pose)))
@@ -108,7 +108,7 @@ def test_poses_may_be_more_than_a_metre_apart(bent: tuple[Readings, Odometry]) -
 
 
 @pytest.mark.slow
-def test_a_drive_with_few_poses_is_refined(exact: Recording, bent: tuple[Readings, Odometry]) -> None:
+def test_drive_with_few_poses_is_refined(exact: Recording, bent: tuple[Readings, Odometry]) -> None:
     readings, odometry = with_few_poses(*bent, 1.1)
     found = Refiner(Parameters()).run(readings, odometry)
     assert found.accepted and not found.jumps
@@ -116,7 +116,7 @@ def test_a_drive_with_few_poses_is_refined(exact: Recording, bent: tuple[Reading
     assert off(exact, found.trajectory) < 0.2
 
 
-def test_a_doubtful_step_may_be_longer_than_the_way_that_is_looked_back(bent: tuple[Readings, Odometry]) -> None:
+def test_doubtful_step_longer_than_the_examined_path_is_no_jump(bent: tuple[Readings, Odometry]) -> None:
     readings, _ = bent
     pose = np.array([[0.0, 0.0, 0.0], [jumping.LOOKED_BACK + 5.0, 0.0, 0.0]])
     odometry = Odometry.of(readings.stamp.min() + np.array([0, 10_000_000_000]), pose)
@@ -126,7 +126,7 @@ def test_a_doubtful_step_may_be_longer_than_the_way_that_is_looked_back(bent: tu
     assert found.tolist() == jumped_to.tolist() == []
 
 
-def test_a_doubtful_step_is_judged_by_the_readings_up_to_the_next_jump(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_doubtful_step_is_judged_by_readings_up_to_the_next_jump(monkeypatch: pytest.MonkeyPatch) -> None:
     judged: list[tuple[int, int]] = []
 
     class Check:
@@ -155,7 +155,7 @@ def test_a_doubtful_step_is_judged_by_the_readings_up_to_the_next_jump(monkeypat
     assert judged == [(150, 150)]
 
 
-def test_driving_is_no_jump(bent: tuple[Readings, Odometry]) -> None:
+def test_drive_without_jumps_has_no_jumps(bent: tuple[Readings, Odometry]) -> None:
     _, odometry = bent
     assert not len(jumps(odometry))
     assert since_jump(odometry) is odometry
@@ -163,7 +163,7 @@ def test_driving_is_no_jump(bent: tuple[Readings, Odometry]) -> None:
     assert not len(jumps(nothing)) and since_jump(nothing) is nothing
 
 
-def test_odometry_that_begins_anew_goes_on_where_the_robot_stood(
+def test_restarted_odometry_continues_where_the_robot_stood(
     exact: Recording, outcome: tuple[Readings, Odometry, Refinement]
 ) -> None:
     readings, odometry, found = outcome
@@ -181,9 +181,9 @@ def test_odometry_that_begins_anew_goes_on_where_the_robot_stood(
     assert found.noise > 0.0 and odometry.stamp[0] <= begin < end <= odometry.stamp[-1]
 
 
-def test_exact_odometry_that_begins_anew_is_put_together_and_otherwise_stays(exact: Recording) -> None:
+def test_restarted_exact_odometry_is_joined_and_otherwise_kept(exact: Recording) -> None:
     true = odometry_of(exact)
-    readings, odometry = begun_anew(exact.readings, true, 0.4, (5.0, -3.0, 2.0))
+    readings, odometry = restarted(exact.readings, true, 0.4, (5.0, -3.0, 2.0))
     found = Refiner(Parameters()).run(readings, odometry)
     assert found.accepted and not found.unplaced
     assert off(exact, found.trajectory) < 0.08
@@ -195,7 +195,7 @@ def test_exact_odometry_that_begins_anew_is_put_together_and_otherwise_stays(exa
 
 
 @pytest.mark.slow
-def test_missing_messages_are_no_reason_to_move_exact_odometry(exact: Recording) -> None:
+def test_missing_messages_do_not_change_exact_odometry(exact: Recording) -> None:
     readings, odometry = without_messages(exact.readings, odometry_of(exact), 5.0)
     assert len(jumps(odometry)) == 1
     found = Refiner(Parameters()).run(readings, odometry)
@@ -205,7 +205,7 @@ def test_missing_messages_are_no_reason_to_move_exact_odometry(exact: Recording)
 
 
 @pytest.mark.slow
-def test_a_robot_that_was_carried_away_is_told_of(exact: Recording, bent: tuple[Readings, Odometry]) -> None:
+def test_robot_that_was_carried_away_gives_a_warning(exact: Recording, bent: tuple[Readings, Odometry]) -> None:
     readings, odometry = bent
     other = drive(building_world(), building_tour()[12:20], 0.15, sonar_ring(16), NOISY, seed=5)
     elsewhere, gap = odometry_of(other), int(odometry.stamp[-1]) + 10**8
@@ -229,8 +229,8 @@ def test_a_robot_that_was_carried_away_is_told_of(exact: Recording, bent: tuple[
 
 
 @pytest.mark.slow
-def test_a_few_readings_after_a_jump_are_not_enough(bent: tuple[Readings, Odometry]) -> None:
-    readings, odometry = begun_anew(*bent, 0.98)
+def test_few_readings_after_a_jump_give_a_warning(bent: tuple[Readings, Odometry]) -> None:
+    readings, odometry = restarted(*bent, 0.98)
     found = Refiner(Parameters()).run(readings, odometry)
     assert found.unplaced and 'do not determine' in found.jumps
     assert found.accepted, 'the part before is refined'
@@ -244,8 +244,8 @@ def test_a_few_readings_after_a_jump_are_not_enough(bent: tuple[Readings, Odomet
 
 
 @pytest.mark.slow
-def test_a_few_messages_before_a_jump_do_not_matter(exact: Recording, bent: tuple[Readings, Odometry]) -> None:
-    readings, odometry = begun_anew(*bent, 0.01, (30.0, 0.0, 0.0))
+def test_drive_with_a_jump_after_few_messages_is_refined(exact: Recording, bent: tuple[Readings, Odometry]) -> None:
+    readings, odometry = restarted(*bent, 0.01, (30.0, 0.0, 0.0))
     found = Refiner(Parameters()).run(readings, odometry)
     assert found.accepted
     first = jumps(odometry)[0]
@@ -253,7 +253,7 @@ def test_a_few_messages_before_a_jump_do_not_matter(exact: Recording, bent: tupl
 
 
 @pytest.mark.slow
-def test_a_simulated_robot_may_turn_at_once(exact: Recording, bent: tuple[Readings, Odometry]) -> None:
+def test_turns_of_a_simulated_robot_at_once_are_no_jumps(exact: Recording, bent: tuple[Readings, Odometry]) -> None:
     _, true = turning_at_once(exact.readings, odometry_of(exact), odometry_of(exact))
     readings, odometry = turning_at_once(*bent, odometry_of(exact))
     assert len(doubtful_steps(odometry)) == 8 and not len(jumps(odometry))
@@ -265,7 +265,7 @@ def test_a_simulated_robot_may_turn_at_once(exact: Recording, bent: tuple[Readin
 
 @pytest.mark.slow
 @pytest.mark.parametrize('at_once', [False, True])
-def test_a_yaw_that_begins_anew_is_told_from_turns(
+def test_restarted_yaw_is_distinguished_from_turns(
     exact: Recording, bent: tuple[Readings, Odometry], at_once: bool
 ) -> None:
     readings, odometry, true = *bent, odometry_of(exact)
@@ -274,7 +274,7 @@ def test_a_yaw_that_begins_anew_is_told_from_turns(
         _, true = turning_at_once(exact.readings, true, true)
     first = int(0.55 * len(odometry.stamp))
     x, y, yaw = odometry.pose[first].tolist()
-    readings, odometry = begun_anew(readings, odometry, 0.55, (x, y, yaw + 1.2))
+    readings, odometry = restarted(readings, odometry, 0.55, (x, y, yaw + 1.2))
     assert first in doubtful_steps(odometry) and not len(jumps(odometry))
     found = Refiner(Parameters()).run(readings, odometry)
     assert found.accepted and found.jumps.count('the readings fit the pose of the robot before it') == 1
@@ -284,14 +284,14 @@ def test_a_yaw_that_begins_anew_is_told_from_turns(
 
 @pytest.mark.parametrize('stood', [False, True])
 @pytest.mark.parametrize('turned', [False, True])
-def test_a_turn_is_a_jump_only_if_readings_fit_where_the_robot_stood_alone(
+def test_turn_is_a_jump_only_if_readings_fit_only_the_pose_before(
     bent: tuple[Readings, Odometry], monkeypatch: pytest.MonkeyPatch, stood: bool, turned: bool
 ) -> None:
     readings, odometry = bent
     first = len(odometry.stamp) // 2
     before = odometry.pose[first - 1]
     x, y, yaw = odometry.pose[first].tolist()
-    readings, odometry = begun_anew(readings, odometry, 0.5, (x, y, yaw + 1.2))
+    readings, odometry = restarted(readings, odometry, 0.5, (x, y, yaw + 1.2))
     where = {tuple(before.tolist()): stood, tuple(odometry.pose[first].tolist()): turned}
     monkeypatch.setattr(jumping._FitCheck, 'fits', lambda self, around, begin, least: where[tuple(begin.tolist())])
     nothing, stop = np.zeros(0, np.int64), np.zeros(1, np.uint8)
@@ -299,7 +299,7 @@ def test_a_turn_is_a_jump_only_if_readings_fit_where_the_robot_stood_alone(
     assert found.tolist() == ([first] if stood and not turned else [])
 
 
-def test_odometry_that_always_jumps_is_refused(bent: tuple[Readings, Odometry]) -> None:
+def test_odometry_with_many_jumps_is_not_refined(bent: tuple[Readings, Odometry]) -> None:
     readings, odometry = bent
     pose = odometry.pose.copy()
     pose[np.arange(len(pose)) // (len(pose) // 50) % 2 == 1] += np.array([4.0, 0.0, 0.0])
@@ -309,8 +309,8 @@ def test_odometry_that_always_jumps_is_refused(bent: tuple[Readings, Odometry]) 
 
 
 @pytest.mark.slow
-def test_odometry_may_begin_anew_again_and_again(exact: Recording, bent: tuple[Readings, Odometry]) -> None:
-    readings, odometry = begun_anew(*begun_anew(*bent, 0.4), 0.7)
+def test_odometry_that_restarts_twice_is_joined(exact: Recording, bent: tuple[Readings, Odometry]) -> None:
+    readings, odometry = restarted(*restarted(*bent, 0.4), 0.7)
     assert len(jumps(odometry)) == 2
     found = Refiner(Parameters()).run(readings, odometry)
     assert found.accepted and not found.unplaced
@@ -319,7 +319,7 @@ def test_odometry_may_begin_anew_again_and_again(exact: Recording, bent: tuple[R
 
 
 @pytest.mark.slow
-def test_odometry_that_jumps_back_is_where_it_was(exact: Recording) -> None:
+def test_odometry_that_jumps_back_has_its_earlier_pose(exact: Recording) -> None:
     readings, true = exact.readings, odometry_of(exact)
     first, second = (int(part * len(true.stamp)) for part in (0.4, 0.6))
     pose = true.pose.copy()
@@ -332,9 +332,7 @@ def test_odometry_that_jumps_back_is_where_it_was(exact: Recording) -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize('count', [1, 3])
-def test_poses_that_odometry_jumps_to_and_back_are_left_out(
-    exact: Recording, bent: tuple[Readings, Odometry], count: int
-) -> None:
+def test_outliers_of_odometry_are_left_out(exact: Recording, bent: tuple[Readings, Odometry], count: int) -> None:
     readings, odometry = bent
     pose = odometry.pose.copy()
     for at in np.linspace(20, len(pose) - 20, 30).astype(int).tolist():
@@ -349,7 +347,7 @@ def test_poses_that_odometry_jumps_to_and_back_are_left_out(
     assert off(exact, found.trajectory) < 0.2
 
 
-def test_with_outliers_a_drive_that_is_left_alone_is_as_it_came(exact: Recording) -> None:
+def test_drive_with_outliers_that_is_not_refined_is_unchanged(exact: Recording) -> None:
     readings, true = exact.readings, odometry_of(exact)
     pose = true.pose.copy()
     pose[100] += np.array([3.0, 2.0, 1.0])
@@ -360,9 +358,7 @@ def test_with_outliers_a_drive_that_is_left_alone_is_as_it_came(exact: Recording
     assert found.readings is came and found.trajectory is wild
 
 
-def test_it_can_be_cancelled_while_parts_are_placed(
-    bent: tuple[Readings, Odometry], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_placing_of_parts_can_be_cancelled(bent: tuple[Readings, Odometry], monkeypatch: pytest.MonkeyPatch) -> None:
     refiner = Refiner(Parameters())
     monkeypatch.setattr(
         refiner, '_whole', lambda readings, odometry, least: Refinement(False, '', readings, odometry, {})
@@ -375,11 +371,11 @@ def test_it_can_be_cancelled_while_parts_are_placed(
 
     monkeypatch.setattr(jumping, 'OnMap', cancels)
     with pytest.raises(Cancelled):
-        refiner.run(*begun_anew(*bent, 0.5))
+        refiner.run(*restarted(*bent, 0.5))
 
 
-def test_following_begins_behind_the_last_jump(exact: Recording, bent: tuple[Readings, Odometry]) -> None:
-    readings, odometry = begun_anew(*bent, 0.3)
+def test_following_begins_after_the_last_jump(exact: Recording, bent: tuple[Readings, Odometry]) -> None:
+    readings, odometry = restarted(*bent, 0.3)
     true = odometry_of(exact)
     known = int(np.searchsorted(true.travel, 0.75 * true.travel[-1]))
     begun = Correction(
@@ -388,20 +384,20 @@ def test_following_begins_behind_the_last_jump(exact: Recording, bent: tuple[Rea
     follower = Follower(begun, {}, Parameters(), 0.03)
     assert follower.follow(readings, odometry)
     assert not follower.obstacle and follower.windows > 5
-    said = follower.correction.extended(odometry.stamp, odometry.pose).pose
-    assert np.hypot(*(said - true.pose)[known:, :2].T).max() < 0.35
+    corrected = follower.correction.extended(odometry.stamp, odometry.pose).pose
+    assert np.hypot(*(corrected - true.pose)[known:, :2].T).max() < 0.35
     assert follower._past.stamp.min() < odometry.stamp[jumps(odometry)[0]], 'what was driven before it is a place, too'
 
 
-def test_following_needs_some_way_behind_a_jump(bent: tuple[Readings, Odometry]) -> None:
-    readings, odometry = begun_anew(*bent, 0.9)
+def test_following_needs_some_metres_after_a_jump(bent: tuple[Readings, Odometry]) -> None:
+    readings, odometry = restarted(*bent, 0.9)
     follower = Follower(Correction(odometry, odometry), {}, Parameters())
     assert not follower.follow(readings, odometry)
     assert 'odometry jumped, and the robot drove only' in follower.obstacle
 
 
-def test_following_ends_where_odometry_jumps(bent: tuple[Readings, Odometry]) -> None:
-    readings, odometry = begun_anew(*bent, 0.7)
+def test_following_ends_at_a_jump_of_odometry(bent: tuple[Readings, Odometry]) -> None:
+    readings, odometry = restarted(*bent, 0.7)
     half = odometry.between(0, int(odometry.stamp[len(odometry.stamp) // 2]))
     follower = Follower(Correction(half, half), {}, Parameters())
     follower.follow(readings, odometry)

@@ -1,4 +1,4 @@
-"""A trajectory that was found stays when a later run leaves odometry as it is, unless odometry is better."""
+"""An earlier trajectory is kept if a later run rejects its own, unless odometry is better."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def first_of(path: Odometry, part: float) -> Odometry:
 
 
 class Sample:
-    """A drive whose odometry drifts, its trajectory as an earlier run found it, and a later run that refuses."""
+    """A drive with odometry that drifts, its trajectory from an earlier run, and a later run that is rejected."""
 
     def __init__(self) -> None:
         exact = drive(building_world(), building_tour()[:10], 0.15, sonar_ring(16), NOISY, seed=3)
@@ -50,7 +50,7 @@ def outcome(sample: Sample, **changes: object) -> Refinement:
     return keep_if_not_worse(**values, parameters=Parameters(), stop=np.zeros(1, np.uint8))  # type: ignore[arg-type]
 
 
-def test_it_stays_and_goes_on(sample: Sample) -> None:
+def test_earlier_trajectory_is_kept_and_extended(sample: Sample) -> None:
     found = outcome(sample)
     assert found.accepted
     assert np.array_equal(found.trajectory.stamp, sample.odometry.stamp)
@@ -66,14 +66,14 @@ def test_it_stays_and_goes_on(sample: Sample) -> None:
     assert found.readings.x == pytest.approx(expected.x, abs=1e-6)
 
 
-def test_it_goes_where_odometry_predicts_readings_better(sample: Sample) -> None:
-    # what was found is wrong, and odometry is exact
+def test_earlier_trajectory_is_dropped_if_odometry_is_better(sample: Sample) -> None:
+    # the earlier trajectory is wrong, and odometry is exact
     wrong = Correction(first_of(sample.true, 0.7), first_of(sample.odometry, 0.7))
     refused = replace(sample.refused, readings=sample.exact.readings, trajectory=sample.true)
     assert outcome(sample, correction=wrong, refused=refused) is refused
 
 
-def test_it_goes_with_the_odometry_that_it_was_of(sample: Sample) -> None:
+def test_earlier_trajectory_of_other_odometry_is_dropped(sample: Sample) -> None:
     elsewhere = Odometry(sample.odometry.stamp, compose(np.array([3.0, 0.0, 1.0]), sample.odometry.pose))
     for odometry in (elsewhere, replace(sample.odometry, stamp=sample.odometry.stamp + 10**13)):
         stamps = sample.refused.readings.stamp + odometry.stamp[0] - sample.odometry.stamp[0]
@@ -84,7 +84,7 @@ def test_it_goes_with_the_odometry_that_it_was_of(sample: Sample) -> None:
     assert outcome(sample, refused=nothing) is nothing
 
 
-def test_poses_that_were_thinned_out_do_not_matter(sample: Sample) -> None:
+def test_earlier_trajectory_is_kept_with_thinned_odometry(sample: Sample) -> None:
     thin = Odometry(sample.odometry.stamp[3::2], sample.odometry.pose[3::2])
     readings = sample.refused.readings
     within = (readings.stamp >= thin.stamp[0]) & (readings.stamp <= thin.stamp[-1])
@@ -94,6 +94,6 @@ def test_poses_that_were_thinned_out_do_not_matter(sample: Sample) -> None:
     assert found.trajectory.pose == pytest.approx(sample.correction.along(sample.odometry).pose[3::2], abs=1e-6)
 
 
-def test_it_can_be_cancelled(sample: Sample) -> None:
+def test_keeping_can_be_cancelled(sample: Sample) -> None:
     with pytest.raises(Cancelled):
         keep_if_not_worse(sample.before, sample.correction, sample.refused, Parameters(), np.ones(1, np.uint8))

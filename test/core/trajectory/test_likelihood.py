@@ -1,4 +1,4 @@
-"""The likelihood of scans in local maps, and their matches, against plain Python and against known poses."""
+"""The likelihood of scans in local maps, and their matches, compared with plain Python and with known poses."""
 
 from __future__ import annotations
 
@@ -59,7 +59,7 @@ def normal(error: float, sigma: float) -> float:
 
 
 def log_likelihood(readings: Readings, t: int, around: LocalMap | None, pose: tuple[float, float, float]) -> float:
-    """log p(z | map) of one reading by the definitions; without a map, of a world where nothing is known."""
+    """log p(z | map) of one reading by definition; without a map, of an unknown world."""
     sigma = max(readings.sigma[t] or MODEL.sigma, 0.05)
     offset = 0.1 * MODEL.surface_offset
     z, z_max = readings.z[t] + offset, readings.z_max[t] + offset
@@ -73,7 +73,7 @@ def log_likelihood(readings: Readings, t: int, around: LocalMap | None, pose: tu
         rays = max(rays, next((n for n in RAYS if n >= 1 + 2 * half * d / 0.1), RAYS[-1]))
         best, distance = 0.0, d
         for bearing in np.linspace(-half, half, rays) + pose[2] + readings.yaw[t]:
-            # what lies off the map has no place of its own
+            # cells outside the map count as unknown
             here, far = NOTHING, distance
             if around is not None:
                 column = math.floor((x + d * math.cos(bearing)) / 0.1 - around.column)
@@ -96,7 +96,7 @@ def log_likelihood(readings: Readings, t: int, around: LocalMap | None, pose: tu
 
 
 @pytest.mark.parametrize('normals', [False, True])
-def test_scores_are_those_of_plain_python(normals: bool) -> None:
+def test_scores_are_those_of_the_twin(normals: bool) -> None:
     around, readings = made_map(1, normals), made_readings(2)
     scan = make_scan(readings, np.stack([readings.x, readings.y, readings.yaw], 1), MODEL, 0.1, NOTHING)
     poses = np.random.default_rng(3).uniform(-3.0, 3.0, (40, 3))
@@ -112,23 +112,23 @@ def test_scores_are_those_of_plain_python(normals: bool) -> None:
 
 
 @pytest.mark.parametrize('count', [0, 1, SIDE_BY_SIDE + 1, LANES, LANES + 1, 2 * LANES + 5])
-def test_poses_that_are_asked_side_by_side_do_not_change_each_other(count: int) -> None:
+def test_scores_of_many_poses_equal_those_of_single_poses(count: int) -> None:
     around, readings, rng = made_map(1, True), made_readings(5), np.random.default_rng(count)
     scan = make_scan(readings, np.stack([readings.x, readings.y, readings.yaw], 1), MODEL, 0.1, NOTHING)
-    # some stand off the map; some have one yaw, in any order
+    # some poses are off the map, and some have equal yaws, in any order
     poses = rng.uniform(-4.0, 4.0, (count, 3))
     poses[:, 2] = np.where(rng.random(count) < 0.5, poses[:, 2].round(), poses[:, 2])
     each = [scores(scan, around, pose[None], 2)[0] for pose in poses]
     assert (scores(scan, around, poses, 2) == each).all()
 
 
-def test_readings_of_what_nobody_knows_count_nothing() -> None:
+def test_score_in_an_unknown_map_is_zero() -> None:
     readings = made_readings(3)
     scan = make_scan(readings, np.stack([readings.x, readings.y, readings.yaw], 1), MODEL, 0.1, NOTHING)
     assert scores(scan, made_map(1, False), np.array([[90.0, 9.0, 1.0]])) == pytest.approx([0.0], abs=1e-3)
 
 
-def test_part_of_the_readings_stands_for_all() -> None:
+def test_score_of_a_part_of_the_readings_is_scaled_to_all() -> None:
     around, readings = made_map(1, False), made_readings(4)
     both = Readings.from_columns(
         **{
@@ -143,7 +143,7 @@ def test_part_of_the_readings_stands_for_all() -> None:
 
 @pytest.fixture(scope='module')
 def room():
-    """A map of a room, and a scan taken a little later; the frame of both is the world's."""
+    """A map of a room, and a scan taken a little later; both are in the frame of the world."""
     path = np.array([[2.0, 2.0], [4.5, 2.0], [4.5, 5.5], [2.0, 5.5]])
     recording = drive(rooms_world(), path, 0.1, sonar_ring(16), NOISY, seed=1)
     readings, count = recording.readings, len(recording.robot)
@@ -154,31 +154,31 @@ def room():
     return around, make_scan(scan, np.stack([scan.x, scan.y, scan.yaw], 1), MODEL, 0.1, NOTHING)
 
 
-def test_a_scan_fits_where_it_was_taken(room) -> None:
+def test_scan_matches_the_pose_where_it_was_taken(room) -> None:
     around, scan = room
     poses = grid_around(np.zeros(3), np.array([0.2, 0.2, 0.09]))
     found = poses[scores(scan, around, poses).argmax()]
     for _ in range(3):
         match = measure(scan, around, found)
         found = match.pose
-    # the scan turns about the origin, several metres away: what counts is where the robot is
+    # the scan turns about the origin, several metres away; compare the position of the robot
     robot = np.array([4.5, 4.0, 0.0])
     moved = compose(found, robot) - robot
     assert np.hypot(*moved[:2]) < 0.06
     assert abs(moved[2]) < math.radians(1.5)
 
 
-def test_the_parabola_is_that_of_the_scores(room) -> None:
+def test_parabola_fits_the_scores(room) -> None:
     around, scan = room
     match = measure(scan, around, np.zeros(3), len(scan.readings))
     assert match.score == pytest.approx(scores(scan, around, np.zeros((1, 3)))[0])
     curvature = np.linalg.eigvalsh(match.information * np.outer(CURVED, CURVED))
     assert curvature.min() > -1e-9
-    # along the most curved direction: least squares of the three values in a line, among others
+    # along the most curved direction: least squares of three values on a line, among others
     assert curvature.max() < 60 * len(scan.readings)
 
 
-def test_a_bare_wall_measures_no_way_along_it() -> None:
+def test_bare_wall_gives_no_information_along_it() -> None:
     hit = np.full((60, 60), 0.01, np.float32)
     hit[40] = 0.66
     none = np.zeros_like(hit)
@@ -192,7 +192,7 @@ def test_a_bare_wall_measures_no_way_along_it() -> None:
     assert abs(match.pose[1]) < 0.06
 
 
-def test_a_local_map_moves_with_its_readings() -> None:
+def test_local_map_moves_with_its_readings() -> None:
     readings = drive(rooms_world(), np.array([[2.0, 2.0], [4.5, 2.0]]), 0.1, sonar_ring(16), NOISY, seed=1).readings
     stop = np.zeros(1, np.uint8)
     one = local_map(readings, Parameters(), stop)

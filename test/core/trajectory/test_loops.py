@@ -1,4 +1,4 @@
-"""Places seen before: where they are looked for, and which of them are believed."""
+"""Loop closures: where places are searched, and which are accepted."""
 
 from __future__ import annotations
 
@@ -24,25 +24,25 @@ from forward_grid_mapper.simulation.sonar import NOISY, sonar_ring
 from forward_grid_mapper.simulation.world import Floorplan
 
 BETWEEN = 22.0
-"""Metres of progress between two visits of the same rooms."""
+"""Metres of progress between two visits to the same rooms."""
 
 OFF = np.array([0.55, 0.3, 0.0])
 SIGMA = 0.12
-"""By how much nodes of the second visit are off, and what is said of it: metres."""
+"""Errors of the nodes of the second visit, and the stated error: metres."""
 
 
 @pytest.fixture(scope='module')
 def solver() -> Solver:
-    """Return the solver of a drive whose odometry is right."""
+    """Return the solver of a drive with exact odometry."""
     return Solver(*tour_with(sonar_ring(16)), quietly)
 
 
 def wrong_by(found: list[Loop], true: Floats) -> Floats:
-    """Return by how many metres each loop misses the right place."""
+    """Return the error of each loop in metres."""
     return np.array([np.hypot(*np.median(residuals(true, loop.matches.edges())[:, :2], axis=0)) for loop in found])
 
 
-def test_a_place_is_found_where_the_graph_does_not_expect_it(solver) -> None:
+def test_place_is_found_away_from_its_expected_pose(solver) -> None:
     scans, true = solver._scans, solver._windows.node
     second = solver._windows.node_progress > BETWEEN
     nodes = true + np.where(second[:, None], OFF, 0.0)
@@ -56,7 +56,7 @@ def test_a_place_is_found_where_the_graph_does_not_expect_it(solver) -> None:
 
 
 def loop(true: Floats, block: int, place: int, off: float, sigma: float = 0.02) -> Loop:
-    """Return a loop that puts a block aside of where it is."""
+    """Return a loop that places a block beside its true place."""
     found = Matches()
     information = np.diag([sigma**-2, sigma**-2, math.radians(1.0) ** -2])
     for k in range(block - LENGTH // 2, block + LENGTH // 2):
@@ -65,7 +65,7 @@ def loop(true: Floats, block: int, place: int, off: float, sigma: float = 0.02) 
     return Loop(block, place, found)
 
 
-def test_a_wrong_place_does_not_take_right_ones_with_it(solver) -> None:
+def test_wrong_loop_is_dropped_and_right_ones_are_kept(solver) -> None:
     start = solver.along_walls()
     true, block = start.nodes, len(start.nodes) - 5
     right = [loop(true, block, place, 0.0) for place in (5, 9)]
@@ -76,7 +76,7 @@ def test_a_wrong_place_does_not_take_right_ones_with_it(solver) -> None:
 
 
 def gallery(bays: list[int]) -> Scans:
-    """Return a drive to and fro along a corridor with bays on both sides, 0.6 m wide, from these columns on."""
+    """Return a drive to and fro along a corridor with bays on both sides, 0.6 m wide, beginning at these columns."""
     plan = Floorplan('gallery', 210, 60)
     for wall, back in ((20, 12), (40, 48)):
         plan.wall('x', wall, (5, 200), tuple((bay, bay + 5) for bay in bays))
@@ -95,7 +95,7 @@ def gallery(bays: list[int]) -> Scans:
 
 
 def found_on_the_way_back(scans: Scans) -> list[Loop | None]:
-    """Return what comes of looking for blocks far from the ends of the corridor, unsure by a metre along it."""
+    """Return the loops of blocks far from the ends of the corridor, with an uncertainty of a metre along it."""
     nodes = scans.windows.node
     usual = match_preceding(scans, nodes, lambda part: None).mean_score
     there = scans.windows.node_progress < 16.0
@@ -109,11 +109,11 @@ def found_on_the_way_back(scans: Scans) -> list[Loop | None]:
     return out
 
 
-def test_a_place_that_fits_about_as_well_elsewhere_is_not_taken() -> None:
+def test_ambiguous_place_is_not_accepted() -> None:
     assert not any(found_on_the_way_back(gallery(list(range(10, 190, 12)))))
 
 
-def test_the_same_place_is_taken_where_bays_are_at_distances_of_their_own() -> None:
+def test_place_is_accepted_if_distances_of_bays_differ() -> None:
     scans = gallery([15, 27, 46, 60, 78, 90, 111, 124, 144, 157, 178])
     found = found_on_the_way_back(scans)
     right = [each for each in found if each is not None]
@@ -121,13 +121,13 @@ def test_the_same_place_is_taken_where_bays_are_at_distances_of_their_own() -> N
     assert wrong_by(right, scans.windows.node).max() < 0.1
 
 
-def test_what_is_known_is_not_looked_for_again(solver, monkeypatch) -> None:
+def test_known_loops_are_not_searched_again(solver, monkeypatch) -> None:
     scans, true = solver._scans, solver._windows.node
     samples = np.random.default_rng(0).standard_normal((40, len(true), 3)) * (0.1, 0.1, 0.01)
     usual = match_preceding(scans, true, lambda part: None).mean_score
     known = find_loops(scans, true, samples, usual, lambda part: None)
     assert loops_of(known)
-    # the whole is carried along, and its end is bent
+    # the whole drive is moved, and its end is bent
     progress = solver._windows.node_progress
     begin = progress[-1] - 8.0
     aside = 0.5 * np.sin(np.maximum(progress - begin, 0.0))
@@ -138,15 +138,15 @@ def test_what_is_known_is_not_looked_for_again(solver, monkeypatch) -> None:
     assert loops_of(kept)
     assert same <= set(kept)
     assert not any(moves[[*key]].any() for key in kept)
-    asked: list[tuple[int, int]] = []
+    searched: list[tuple[int, int]] = []
 
     def search(scans, block, nodes, place, *rest) -> None:
-        asked.append((int(block[len(block) // 2]), place))
+        searched.append((int(block[len(block) // 2]), place))
 
     monkeypatch.setattr(loops, 'find_loop', search)
     again = find_loops(scans, true, samples, usual, lambda part: None, kept)
-    assert asked and not set(asked) & set(kept)
+    assert searched and not set(searched) & set(kept)
     assert {key: again[key] for key in kept if kept[key]} == {key: loop for key, loop in kept.items() if loop}
-    asked.clear()
+    searched.clear()
     assert find_loops(scans, true, samples, usual, lambda part: None, known) == known
-    assert not asked
+    assert not searched

@@ -1,4 +1,4 @@
-"""The pose graph: derivatives, solutions against a general optimiser, and what false matches do to it."""
+"""The pose graph: derivatives, solutions compared with a general optimiser, and the effect of false matches."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ STEP = np.diag([1e3, 1e3, 3e3])
 
 
 def loop_of(count: int = 12) -> np.ndarray:
-    """Poses around a polygon."""
+    """Poses along a polygon."""
     turn = 2 * math.pi / count
     poses = [np.zeros(3)]
     for _ in range(count - 1):
@@ -51,7 +51,7 @@ def graph_of(odometry: Edges, matches: Edges, yaws: Yaws | None = None, walls: W
 
 
 def walls_of(nodes: np.ndarray, wrong: float = 0.0) -> Walls:
-    """Distances from two walls, of nodes 1 to 4 and 3 to 5, one of them wrong."""
+    """Distances from two walls, of nodes 1 to 4 and 3 to 5; one distance is wrong."""
     node, wall = np.array([1, 2, 3, 4, 3, 4, 5]), np.array([0, 0, 0, 0, 1, 1, 1])
     normal = np.where(wall[:, None] == 0, [0.0, 1.0], [-1.0, 0.0])
     place = nodes[node, :2]
@@ -62,7 +62,7 @@ def walls_of(nodes: np.ndarray, wrong: float = 0.0) -> Walls:
     return Walls(node, wall, normal, distance, lever, nodes[node, 2] + 0.01, along, np.full(7, 1e4))
 
 
-def test_poses_compose_and_come_apart() -> None:
+def test_relative_poses_reverse_composition() -> None:
     rng = np.random.default_rng(0)
     a, b = rng.normal(0, 2, (2, 20, 3))
     there = relative(a, compose(a, b))
@@ -72,7 +72,7 @@ def test_poses_compose_and_come_apart() -> None:
     assert home[:, :2] == pytest.approx(0, abs=1e-12)
 
 
-def test_derivatives_are_those_of_small_steps() -> None:
+def test_derivatives_equal_finite_differences() -> None:
     nodes, rng = loop_of(), np.random.default_rng(1)
     edges = Edges(np.array([0, 5, 7]), np.array([3, 2, 11]), rng.normal(0, 1, (3, 3)), np.tile(STEP, (3, 1, 1)))
     one, other = jacobians(nodes, edges)
@@ -85,7 +85,7 @@ def test_derivatives_are_those_of_small_steps() -> None:
 
 
 @pytest.mark.parametrize('part', [1.0, 0.4])
-def test_the_solution_is_that_of_a_general_optimiser(part) -> None:
+def test_solution_equals_that_of_a_general_optimiser(part) -> None:
     nodes = loop_of(6)
     odometry = chain_of(nodes, 0.02)
     match = Edges(np.array([0]), np.array([5]), relative(nodes[0], nodes[5])[None], STEP[None])
@@ -120,7 +120,7 @@ def test_the_solution_is_that_of_a_general_optimiser(part) -> None:
     )
 
 
-def test_false_matches_are_let_go() -> None:
+def test_false_matches_are_ignored() -> None:
     nodes = loop_of(40)
     odometry = chain_of(nodes, 0.01)
     rng = np.random.default_rng(3)
@@ -151,16 +151,16 @@ def test_calibration_is_found_from_matches() -> None:
     assert solve(graph, start, np.zeros(1), samples=1).calibration[0] == pytest.approx(0.05, abs=0.002)
 
 
-def test_deviations_are_as_wide_as_odometry_drifts() -> None:
+def test_samples_spread_as_odometry_drifts() -> None:
     nodes = loop_of(20)
     odometry = chain_of(nodes, 0.0)
     solution = solve(graph_of(odometry, no_edges()), np.array(nodes), np.zeros(1), samples=400)
-    # yaws add up: 19 steps of variance 1 / 3000
+    # variances of the yaw add up: 19 steps of variance 1 / 3000
     assert solution.samples[:, -1, 2].std() == pytest.approx(math.sqrt(19 / 3e3), rel=0.15)
     assert np.abs(solution.samples[:, 0]).max() < 1e-3
 
 
-def test_a_straight_wall_holds_a_drive_straight() -> None:
+def test_straight_wall_keeps_a_drive_straight() -> None:
     rng = np.random.default_rng(5)
     nodes = np.column_stack([np.arange(60) * 0.4, np.zeros((60, 2))])
     odometry = chain_of(nodes, 0.0)
@@ -171,7 +171,7 @@ def test_a_straight_wall_holds_a_drive_straight() -> None:
     start = np.array(walked)
     node, count = np.arange(60), 60
     far = np.full(count, 1.3) + rng.normal(0, 0.01, count)
-    # another wall stands 40 cm back, and was taken for the same one
+    # another wall is 40 cm behind, and was taken for the same wall
     far[30:36] += 0.4
     normal = np.tile([0.0, 1.0], (count, 1))
     none = np.zeros(count)
@@ -184,7 +184,7 @@ def test_a_straight_wall_holds_a_drive_straight() -> None:
     assert solution.samples[:, -1, 1].std() < 0.3 * without.samples[:, -1, 1].std()
 
 
-def test_walls_move_with_the_axes_of_the_map() -> None:
+def test_places_of_walls_in_turned_and_moved_maps() -> None:
     nodes = loop_of(6)
     walls = walls_of(nodes)
     assert walls.total == 2
@@ -194,7 +194,7 @@ def test_walls_move_with_the_axes_of_the_map() -> None:
     assert no_walls().total == 0
 
 
-def test_a_graph_moves_as_a_whole() -> None:
+def test_solution_of_a_moved_graph_is_moved() -> None:
     nodes = loop_of(12)
     odometry = chain_of(nodes, 0.02)
     matches = Edges(np.array([0]), np.array([11]), relative(nodes[0], nodes[11])[None], STEP[None])

@@ -1,4 +1,4 @@
-"""A whole drive: drift is taken out, exact odometry stays, and what cannot be refined is left alone in words."""
+"""Refinement of whole drives: drift is corrected, exact odometry is kept, and unsuitable drives are rejected."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ def bent(tour: Recording) -> tuple[Readings, Odometry]:
 
 @pytest.fixture(scope='module')
 def stages() -> list[str]:
-    """What was going on while `outcome` was made."""
+    """The stages reported while `outcome` was computed."""
     return []
 
 
@@ -61,21 +61,21 @@ def outcome(bent, stages) -> Refinement:
     return Refiner(Parameters()).run(*bent, lambda stage, part: stages.append(stage))
 
 
-def test_an_error_that_is_not_known_is_no_number() -> None:
-    """As with a sweep each metre, where no block has readings enough to be compared."""
+def test_unknown_gain_is_reported_without_a_number() -> None:
+    """For example one sweep each metre, with too few readings in each block."""
     nothing = np.full(20, np.nan)
     assert 'too few readings' in _gain_words(gain(nothing, nothing))
     rng = np.random.default_rng(0)
     assert '± 0.' in _gain_words(gain(rng.random(20), rng.random(20)))
 
 
-def test_drift_is_taken_out(tour, bent, outcome, stages) -> None:
+def test_drift_is_corrected(tour, bent, outcome, stages) -> None:
     _, odometry = bent
     true = odometry_of(tour).pose
     before = rms_after_alignment(odometry.pose, true)
     after = rms_after_alignment(outcome.trajectory.pose, true)
     assert outcome.accepted and outcome.right_angles
-    # walls at right angles explain all of it, so no other way is tried
+    # walls at right angles explain all of it, so no other method is tried
     assert 'matching' in stages and 'scan matching' not in stages
     assert before > 0.8
     assert after < 0.2
@@ -83,9 +83,9 @@ def test_drift_is_taken_out(tour, bent, outcome, stages) -> None:
     assert outcome.trajectory.pose[0] == pytest.approx(odometry.pose[0], abs=1e-6)
 
 
-def test_what_speaks_for_it_is_named(bent, monkeypatch, outcome) -> None:
+def test_reason_of_acceptance_is_named(bent, monkeypatch, outcome) -> None:
     assert outcome.reason.startswith(('readings are predicted', 'with walls at right angles'))
-    # no readings are predicted so much better, and nothing was seen before, so the walls have the word
+    # at this limit the gain of predicted readings does not suffice, and no place was seen twice, so walls decide
     monkeypatch.setattr(refinement, 'LEAST_SIGMAS', 1e9)
     monkeypatch.setattr(refinement, 'has_revisits', lambda *rest: False)
     assert 'with walls at right angles, the readings are more likely by' in Refiner(Parameters()).run(*bent).reason
@@ -93,7 +93,7 @@ def test_what_speaks_for_it_is_named(bent, monkeypatch, outcome) -> None:
 
 @pytest.fixture
 def solved_once(monkeypatch) -> None:
-    """Runs that are judged otherwise need not find the same trajectory again."""
+    """Solve only once: runs with other judgements need not repeat it."""
     solve, found = refinement.solve_hypotheses, []
 
     def once(*rest) -> Solved:
@@ -105,18 +105,18 @@ def solved_once(monkeypatch) -> None:
 
 
 def no_matches(*rest) -> None:
-    """What matches alone say where they say nothing."""
+    """Matches without information."""
 
 
-def test_places_seen_before_prove_what_nothing_nearby_does(tour, bent, monkeypatch, solved_once) -> None:
-    # wheels that are right over metres predict what is near better than the yaws of walls
+def test_recognised_places_prove_what_nearby_readings_do_not(tour, bent, monkeypatch, solved_once) -> None:
+    # wheels that are right over metres predict nearby readings better than yaws from walls do
     monkeypatch.setattr(refinement, 'match_drive', no_matches)
     monkeypatch.setattr(refinement, 'gain_over_drive', lambda *rest: Gain(-0.05, 0.01))
     found, true = Refiner(Parameters()).run(*bent), odometry_of(tour).pose
     assert found.accepted
     assert found.reason.startswith('with recognised places, readings are predicted +')
     assert rms_after_alignment(found.trajectory.pose, true) < 0.2
-    # the same without such places, and without walls that say that the yaw is off
+    # the same without such places, and without walls that contradict the yaw
     monkeypatch.setattr(refinement, 'gain_at_revisits', lambda *rest: Gain(0.0, 0.01))
     left = Refiner(Parameters()).run(*bent)
     monkeypatch.setattr(refinement, 'LEAST_VOTE_GAIN', 1e9)
@@ -125,8 +125,8 @@ def test_places_seen_before_prove_what_nothing_nearby_does(tour, bent, monkeypat
         assert 'does not show that odometry is wrong' in outcome.reason
 
 
-def test_walls_are_no_proof_where_places_seen_before_say_nothing(bent, monkeypatch, solved_once) -> None:
-    # walls that stand askew tell a yaw that is off, and readings are predicted about as well
+def test_walls_are_no_proof_if_recognised_places_do_not_confirm(bent, monkeypatch, solved_once) -> None:
+    # walls that are not parallel give a wrong yaw, and readings are predicted about as well
     monkeypatch.setattr(refinement, 'match_drive', no_matches)
     monkeypatch.setattr(refinement, 'gain_over_drive', lambda *rest: Gain(0.001, 0.01))
     monkeypatch.setattr(refinement, 'gain_at_revisits', lambda *rest: Gain(0.001, 0.01))
@@ -134,7 +134,7 @@ def test_walls_are_no_proof_where_places_seen_before_say_nothing(bent, monkeypat
     assert not left.accepted
     assert left.reason.startswith('with recognised places, readings are predicted +')
     assert 'does not show that odometry is wrong' in left.reason
-    # where the robot came to no place twice, walls are proof, unless readings are predicted worse
+    # if the robot visited no place twice, walls are proof, unless readings are predicted worse
     monkeypatch.setattr(refinement, 'has_revisits', lambda *rest: False)
     found = Refiner(Parameters()).run(*bent)
     assert found.accepted
@@ -149,7 +149,7 @@ def test_walls_are_no_proof_where_places_seen_before_say_nothing(bent, monkeypat
     ('way', 'rounds'),
     [([[2.0, 8.85], [29.0, 8.85]], 1), ([[10.0, 8.85], [14.0, 8.85], [10.0, 8.85]], 1), (TOUR, 2)],
 )
-def test_a_robot_that_came_back_is_told_from_one_that_did_not(way, rounds) -> None:
+def test_revisits_are_detected(way, rounds) -> None:
     points = np.concatenate([np.array(way, float)] * rounds)
     recording = drive(building_world(), points, 0.1, front_array(), NOISY, seed=4)
     windows = cut(recording.readings, odometry_of(recording))
@@ -163,7 +163,7 @@ def test_a_robot_that_came_back_is_told_from_one_that_did_not(way, rounds) -> No
     assert not has_revisits(scans, far)
 
 
-def test_readings_go_along(bent, outcome) -> None:
+def test_readings_move_with_the_trajectory(bent, outcome) -> None:
     readings, odometry = bent
     placed = outcome.readings
     for name in ('z', 'stamp', 'sensor', 'z_max', 'half_angle'):
@@ -175,14 +175,14 @@ def test_readings_go_along(bent, outcome) -> None:
     assert now[:, :2] == pytest.approx(was[:, :2], abs=1e-9)
 
 
-def test_the_map_explains_more(bent, outcome) -> None:
+def test_refined_map_has_a_larger_objective(bent, outcome) -> None:
     drifted, refined = (Mapper(Parameters()).run(readings).objective for readings in (bent[0], outcome.readings))
     assert refined > drifted + 0.1 * len(outcome.readings)
 
 
-def test_exact_odometry_stays(tour, monkeypatch) -> None:
+def test_exact_odometry_is_kept(tour, monkeypatch) -> None:
     odometry = odometry_of(tour)
-    # walls stand at right angles along it, so no other way is tried
+    # walls are at right angles along it, so no other method is tried
     monkeypatch.setattr(refinement, 'match_drive', None)
     left = Refiner(Parameters()).run(tour.readings, odometry)
     assert not left.accepted
@@ -191,7 +191,7 @@ def test_exact_odometry_stays(tour, monkeypatch) -> None:
     assert left.trajectory is odometry
 
 
-def test_a_drive_that_is_moved_gives_the_same_trajectory_moved(bent, outcome) -> None:
+def test_moved_drive_gives_the_moved_trajectory(bent, outcome) -> None:
     readings, odometry = bent
     home = np.array([3.0, -12.0, math.pi / 2])
     sensors = compose(home, np.stack([readings.x, readings.y, readings.yaw], 1))
@@ -202,7 +202,7 @@ def test_a_drive_that_is_moved_gives_the_same_trajectory_moved(bent, outcome) ->
     assert np.hypot(*(back - outcome.trajectory.pose)[:, :2].T).max() < 0.2
 
 
-def test_cancelling_ends_the_work(bent) -> None:
+def test_refinement_can_be_cancelled(bent) -> None:
     refiner = Refiner(Parameters())
     stages = []
 
@@ -226,7 +226,7 @@ def short(readings: Readings, odometry: Odometry) -> tuple[Readings, Odometry]:
     return readings.select(kept), Odometry(odometry.stamp[: last + 1], odometry.pose[: last + 1])
 
 
-def silent(readings: Readings, odometry: Odometry) -> tuple[Readings, Odometry]:
+def without_echoes(readings: Readings, odometry: Odometry) -> tuple[Readings, Odometry]:
     return replace(readings, z=readings.z_max.copy()), odometry
 
 
@@ -244,18 +244,18 @@ def nothing(readings: Readings, odometry: Odometry) -> tuple[Readings, Odometry]
 
 
 @pytest.mark.parametrize(
-    ('spoilt', 'word'),
+    ('spoiled', 'word'),
     [
         (short, '2.0 m long'),
         (still, '0.0 m long'),
-        (silent, 'have an echo'),
+        (without_echoes, 'have an echo'),
         (one_sensor, 'one sensor'),
         (late, 'without odometry'),
         (nothing, 'no poses of odometry'),
     ],
 )
-def test_what_cannot_be_refined_is_left_alone(bent, spoilt, word) -> None:
-    readings, odometry = spoilt(*bent)
+def test_unsuitable_drive_is_not_refined_with_reason(bent, spoiled, word) -> None:
+    readings, odometry = spoiled(*bent)
     left = Refiner(Parameters()).run(readings, odometry)
     assert not left.accepted
     assert word in left.reason
@@ -264,13 +264,13 @@ def test_what_cannot_be_refined_is_left_alone(bent, spoilt, word) -> None:
     assert unfit(*bent) == ''
 
 
-def test_random_ranges_are_left_alone(bent) -> None:
+def test_drive_with_random_ranges_is_not_refined(bent) -> None:
     readings, odometry = bent
     z = np.random.default_rng(0).uniform(0.2, 5.9, len(readings))
     assert not Refiner(Parameters()).run(replace(readings, z=z), odometry).accepted
 
 
-def test_a_straight_drive_without_revisits_is_no_worse() -> None:
+def test_straight_drive_without_revisits_is_no_worse() -> None:
     recording = drive(building_world(), np.array([[2.0, 8.85], [29.0, 8.85]]), 0.1, front_array(), NOISY, seed=4)
     bent = with_drift(recording, LEVELS['middle'], 3)
     true, odometry = odometry_of(recording).pose, odometry_of(bent)
@@ -278,7 +278,7 @@ def test_a_straight_drive_without_revisits_is_no_worse() -> None:
     assert rms_after_alignment(left.trajectory.pose, true) < rms_after_alignment(odometry.pose, true) + 0.02
 
 
-def test_the_noise_of_odometry_is_estimated_or_told(bent, monkeypatch) -> None:
+def test_noise_of_odometry_is_estimated_or_given(bent, monkeypatch) -> None:
     seen = []
 
     def look(windows, at, votes, noises) -> None:
@@ -287,13 +287,13 @@ def test_the_noise_of_odometry_is_estimated_or_told(bent, monkeypatch) -> None:
     monkeypatch.setattr(refinement, 'heading', look)
     windows = cut(*bent)
     scans = Scans(windows, Parameters(), np.zeros(1, np.uint8), held_out(len(windows)))
-    for told in ({}, {'odometry_noise': 0.04}):
-        assert Refiner(Parameters.from_flat(told))._heading(windows, scans) == (None, 0.0)
+    for given in ({}, {'odometry_noise': 0.04}):
+        assert Refiner(Parameters.from_flat(given))._heading(windows, scans) == (None, 0.0)
     assert seen == [NOISES, (0.04,)]
 
 
-@pytest.mark.parametrize(('by_chance', 'witness'), [(45.0, 5.0), (-20.0, 50.0), (None, 50.0)])
-def test_what_sensors_say_by_where_they_look_is_no_witness(bent, monkeypatch, by_chance, witness) -> None:
+@pytest.mark.parametrize(('by_chance', 'evidence'), [(45.0, 5.0), (-20.0, 50.0), (None, 50.0)])
+def test_votes_due_to_the_layout_of_sensors_are_no_evidence(bent, monkeypatch, by_chance, evidence) -> None:
     readings, odometry = bent
     nothing = np.zeros(0)
     found = Heading(nothing.astype(int), nothing, nothing, nothing, Drifts(0.0, 0.0, 0.02), 1.0, 1.0, 50.0, nothing)
@@ -301,4 +301,4 @@ def test_what_sensors_say_by_where_they_look_is_no_witness(bent, monkeypatch, by
     monkeypatch.setattr(refinement, 'heading', lambda *rest: answers.pop(0))
     refiner, windows = Refiner(Parameters()), cut(readings, odometry)
     scans = Scans(windows, Parameters(), np.zeros(1, np.uint8), held_out(len(windows)))
-    assert refiner._heading(windows, scans) == (found, witness)
+    assert refiner._heading(windows, scans) == (found, evidence)

@@ -1,4 +1,4 @@
-"""Where a drive lies on the map of another: found again wherever it was put, and left where nothing can be told."""
+"""Registration of a drive with the map of another: it is found after a shift, and kept if readings do not decide."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ from forward_grid_mapper.simulation.world import building_tour, building_world
 
 @pytest.fixture(scope='module')
 def two() -> tuple[Recording, Recording]:
-    """Two drives the same way, exact both."""
+    """Two exact drives along the same path."""
     tour = building_tour()[:6]
     one, other = (drive(building_world(), tour, 0.15, front_array(), NOISY, seed=seed) for seed in (3, 4))
     return one, other
@@ -38,9 +38,7 @@ def placed(readings: Readings, begin: np.ndarray, others: Readings) -> Registrat
 
 
 @pytest.mark.parametrize('off', [(0.1, -0.05, 6.0), (-0.2, 0.1, -8.0), (0.0, 0.0, 2.0)])
-def test_a_drive_that_was_put_askew_is_put_right(
-    two: tuple[Recording, Recording], off: tuple[float, float, float]
-) -> None:
+def test_shifted_drive_is_moved_back(two: tuple[Recording, Recording], off: tuple[float, float, float]) -> None:
     one, other = two
     true = other.robot[0]
     begin = compose(true, np.array([off[0], off[1], math.radians(off[2])]))
@@ -51,13 +49,13 @@ def test_a_drive_that_was_put_askew_is_put_right(
     assert abs(math.degrees(yaw)) < 0.7
 
 
-def test_a_drive_that_fits_stays(two: tuple[Recording, Recording]) -> None:
+def test_drive_that_fits_is_not_moved(two: tuple[Recording, Recording]) -> None:
     one, other = two
     found = placed(other.readings, other.robot[0], one.readings)
     assert np.hypot(*(found.begin - other.robot[0])[:2]) < 0.05
 
 
-def test_a_drive_elsewhere_stays(two: tuple[Recording, Recording]) -> None:
+def test_drive_without_overlap_is_not_moved(two: tuple[Recording, Recording]) -> None:
     one, other = two
     far = replace(other.readings, x=other.readings.x + 100.0)
     begin = other.robot[0] + np.array([100.0, 0.0, 0.0])
@@ -66,7 +64,7 @@ def test_a_drive_elsewhere_stays(two: tuple[Recording, Recording]) -> None:
     assert found.gain.sigmas < 2.3
 
 
-def test_blocks_are_the_readings_one_by_one_and_what_is_new_says_nothing(two: tuple[Recording, Recording]) -> None:
+def test_gains_of_blocks_are_means_and_unknown_space_counts_zero(two: tuple[Recording, Recording]) -> None:
     one, other = two
     around = OnMap(other.readings, other.robot[0], one.readings, Parameters(), np.zeros(1, np.uint8))
     for begin in (other.robot[0], compose(other.robot[0], np.array([0.3, -0.2, 0.2]))):
@@ -82,23 +80,23 @@ def test_blocks_are_the_readings_one_by_one_and_what_is_new_says_nothing(two: tu
     assert math.hypot(x, y) < 0.1 and abs(math.degrees(yaw)) < 1.0
 
 
-def test_the_order_of_readings_does_not_matter(two: tuple[Recording, Recording]) -> None:
+def test_result_does_not_depend_on_the_order_of_readings(two: tuple[Recording, Recording]) -> None:
     one, other = two
     begin = compose(other.robot[0], np.array([0.0, 0.0, 0.1]))
     turned = readings_moved(other.readings, other.robot[0], begin)
     shuffled = turned.select(np.random.default_rng(1).permutation(len(turned)))
-    # of one stamp the order of sensors is another, so another few readings are asked
+    # for equal stamps the order of sensors differs, so a few other readings are evaluated
     a, b = (placed(each, begin, one.readings).begin for each in (turned, shuffled))
     assert a == pytest.approx(b, abs=0.03)
 
 
-def test_it_can_be_cancelled(two: tuple[Recording, Recording]) -> None:
+def test_registration_can_be_cancelled(two: tuple[Recording, Recording]) -> None:
     one, other = two
     with pytest.raises(Cancelled):
         register(other.readings, other.robot[0], one.readings, Parameters(), np.ones(1, np.uint8))
 
 
-def test_poses_and_readings_move_alike() -> None:
+def test_poses_and_readings_are_moved_together() -> None:
     rng = np.random.default_rng(0)
     poses = np.cumsum(rng.normal(0.0, 1.0, (50, 3)), 0)
     begin = rng.normal(0.0, 3.0, 3)

@@ -1,4 +1,4 @@
-"""Stretches that were put in a wrong place, and places where a right angle may have been lost."""
+"""Parts of a drive in a wrong place, and places where a right angle may have been lost."""
 
 from __future__ import annotations
 
@@ -35,14 +35,14 @@ from forward_grid_mapper.simulation.sonar import sonar_ring
 from forward_grid_mapper.simulation.world import building_tour
 
 OFF = np.array([3.2, -1.4, math.radians(3.0)])
-"""By how much the way back is off."""
+"""Error of the way back."""
 
 
 @pytest.fixture(scope='module')
 def there_and_back() -> Tour:
     """Return a drive through some rooms and back."""
-    way = building_tour()[:12]
-    return tour_with(sonar_ring(16), np.concatenate([way, way[-2::-1]]))
+    path = building_tour()[:12]
+    return tour_with(sonar_ring(16), np.concatenate([path, path[-2::-1]]))
 
 
 def turning(tour: Tour) -> int:
@@ -51,18 +51,18 @@ def turning(tour: Tour) -> int:
 
 
 def astray(tour: Tour) -> Floats:
-    """Return the nodes with the way back off."""
+    """Return the nodes with the wrong way back."""
     nodes, first = tour.windows.node.copy(), turning(tour)
     nodes[first:] = compose(compose(nodes[first], OFF), relative(nodes[first], nodes[first:]))
     return nodes
 
 
 def found_at(tour: Tour, blocks: list[int], place: int) -> list[Loop]:
-    """Return loops of some blocks, by their numbers, with a place."""
+    """Return loops of these blocks, by number, with a place."""
     return [Loop(block * LENGTH + LENGTH // 2, place, Matches()) for block in blocks]
 
 
-def test_a_stretch_is_found_farther_off_than_single_blocks_are_looked_for(there_and_back) -> None:
+def test_long_part_is_found_farther_away_than_single_blocks(there_and_back) -> None:
     scans, true = there_and_back.scans, there_and_back.windows.node
     blocks = revisits(scans, true)
     stretch = windows_of(blocks[blocks * LENGTH > turning(there_and_back)][:RUN], len(true))
@@ -75,7 +75,7 @@ def test_a_stretch_is_found_farther_off_than_single_blocks_are_looked_for(there_
 
 
 @pytest.mark.slow
-def test_what_was_led_astray_is_put_where_it_belongs(there_and_back) -> None:
+def test_misplaced_part_is_moved_to_its_place(there_and_back) -> None:
     true, first = there_and_back.windows.node, turning(there_and_back)
     solver = Solver(*there_and_back, quietly)
     found = match_preceding(there_and_back.scans, true, lambda part: None)
@@ -87,7 +87,7 @@ def test_what_was_led_astray_is_put_where_it_belongs(there_and_back) -> None:
     assert len(loops) > FEW
 
 
-def test_another_place_is_taken_only_if_readings_are_predicted_better(there_and_back, monkeypatch) -> None:
+def test_other_place_is_rejected_unless_it_predicts_readings_better(there_and_back, monkeypatch) -> None:
     true, first = there_and_back.windows.node, turning(there_and_back)
 
     def aside(scans, nodes, stretch) -> Floats:
@@ -114,7 +114,7 @@ def test_another_place_is_taken_only_if_readings_are_predicted_better(there_and_
     assert loops == []
 
 
-def test_what_is_in_its_place_stays(there_and_back) -> None:
+def test_correctly_placed_drive_is_unchanged(there_and_back) -> None:
     solver, true = Solver(*there_and_back, quietly), there_and_back.windows.node
     start = solution_at(true, 4)
     solution, loops = solver._with_stretches_relocated(Matches().edges(), [], start, 1.0)
@@ -122,7 +122,7 @@ def test_what_is_in_its_place_stays(there_and_back) -> None:
     assert loops == []
 
 
-def test_only_stretches_that_are_hardly_recognised_are_searched() -> None:
+def test_only_parts_with_few_recognised_blocks_are_searched() -> None:
     blocks = np.arange(10, 30)
     assert unsupported(blocks, set(range(10, 30)), 0) is None
     lost = set(range(10, 20)) | {24}
@@ -131,13 +131,13 @@ def test_only_stretches_that_are_hardly_recognised_are_searched() -> None:
     assert len(stretch) == RUN
     assert len(lost.intersection(stretch.tolist())) <= 1
     assert stretch[0] >= 19
-    # blocks that lie far apart are no stretch
+    # blocks that are far apart form no part
     assert unsupported(np.arange(10, 100, 5), set(), 0) is None
     assert unsupported(blocks[: RUN - 1], set(), 0) is None
     assert unsupported(blocks, set(), int(blocks[-1])) is None
 
 
-def test_the_way_past_a_place_is_known_if_what_was_before_is_recognised(there_and_back) -> None:
+def test_place_is_confirmed_if_blocks_before_it_are_recognised(there_and_back) -> None:
     scans, nodes, middle = there_and_back.scans, there_and_back.windows.node, turning(there_and_back)
     after = [block for block in revisits(scans, nodes).tolist() if block * LENGTH > middle]
     assert len(after) >= 2 * CONFIRMING
@@ -148,7 +148,7 @@ def test_the_way_past_a_place_is_known_if_what_was_before_is_recognised(there_an
     assert recognised(found_at(there_and_back, after, 4)) == set(after)
 
 
-def test_a_doubt_lies_in_the_middle_of_where_certainty_falls() -> None:
+def test_doubtful_place_is_in_the_middle_of_a_drop_of_certainty() -> None:
     at = np.arange(0, 60, 3)
     certain = np.ones(20)
     certain[6:] -= 0.1
@@ -161,23 +161,23 @@ def test_a_doubt_lies_in_the_middle_of_where_certainty_falls() -> None:
     little = np.linspace(1.0, 1.0 - DOUBTFUL / 2, 20)
     assert doubts(at, little) == ()
     assert np.array(slight(at, little)) == pytest.approx(np.column_stack([at[1:], np.full(19, DOUBTFUL / 38)]))
-    # what has no name as a doubt is left, and nothing is counted twice
+    # the rest is slight doubts, and nothing is counted twice
     both = certain * little
     total = sum(p for _, p in (*doubts(at, both), *slight(at, both)))
     assert total == pytest.approx(1.0 - both[-1], abs=1e-9)
 
 
 @pytest.mark.parametrize('lost', [0, pytest.param(1, marks=pytest.mark.slow)])
-def test_a_right_angle_that_was_lost_is_found_again(there_and_back, lost) -> None:
+def test_lost_right_angle_is_corrected(there_and_back, lost) -> None:
     odometry, windows, scans, heading = there_and_back
     node, true = turning(there_and_back) - 6, windows.node
 
     def solver_of(other: Heading) -> Solver:
         return Solver(odometry, windows, scans, other, quietly)
 
-    # what is slight is known as well where places were recognised, and stays at the end of the drive
+    # slight doubts are resolved as well if places were recognised, but not at the end of the drive
     little = (node, 0.02), (len(windows) - 2, 0.03)
-    # before the first metres nothing was seen: what lies there is in doubt for good, and in the way of nothing
+    # before the first metres nothing was seen, so a doubt there stays, and does not prevent the others
     open_doubts = (1, 0.03), (node, 0.4)
     doubtful = replace(heading.turned(node, lost * math.pi / 2), certainty=0.52, doubts=open_doubts, slight=little)
     solver = solver_of(doubtful)
@@ -189,7 +189,7 @@ def test_a_right_angle_that_was_lost_is_found_again(there_and_back, lost) -> Non
 
 
 @pytest.mark.slow
-def test_without_a_revisit_a_doubt_stays(there_and_back) -> None:
+def test_doubt_without_revisits_stays(there_and_back) -> None:
     odometry, windows, scans, heading = there_and_back
     solvers: list[Solver] = []
 
@@ -202,25 +202,25 @@ def test_without_a_revisit_a_doubt_stays(there_and_back) -> None:
     first = solver_of(doubtful)
     found = solve_hypotheses(scans, doubtful, first, first.along_walls(), solver_of)
     assert found.certainty == pytest.approx(0.6)
-    # so many would take many solutions
+    # more doubts would need too many solutions
     assert solvers == [first]
 
 
 @pytest.mark.parametrize('recognises', [False, True])
 @pytest.mark.parametrize('lost', [[], [30], [50], [30, 50], [20, 30, 50]])
-def test_right_angles_that_were_lost_are_asked_one_after_the_other(
-    there_and_back, monkeypatch, lost, recognises
-) -> None:
-    """With solutions that are right up to the first right angle that is lost."""
+def test_lost_right_angles_are_examined_one_after_the_other(there_and_back, monkeypatch, lost, recognises) -> None:
+    """With solutions that are right up to the first lost right angle."""
     _, windows, scans, right = there_and_back
-    asked_at = 20, 30, 50
-    assert windows.node_progress[asked_at[0]] > APART
+    examined_at = 20, 30, 50
+    assert windows.node_progress[examined_at[0]] > APART
     solutions: list[Heading] = []
 
     def first_lost(heading: Heading) -> float:
         turns = np.round((heading.correction - right.correction) / (math.pi / 2))
-        before = [int(np.searchsorted(right.at, node)) - 1 for node in asked_at]
-        return min((node for node, k in zip(asked_at, before, strict=True) if turns[k] != turns[k + 1]), default=99.0)
+        before = [int(np.searchsorted(right.at, node)) - 1 for node in examined_at]
+        return min(
+            (node for node, k in zip(examined_at, before, strict=True) if turns[k] != turns[k + 1]), default=99.0
+        )
 
     def matched(scans, heading, solver, along) -> hypotheses.Solved:
         solutions.append(heading)
@@ -231,23 +231,23 @@ def test_right_angles_that_were_lost_are_asked_one_after_the_other(
     monkeypatch.setattr(hypotheses, 'confirmed', lambda scans, nodes, loops, node: recognises and nodes[0, 0] > node)
     monkeypatch.setattr(hypotheses, 'predicted', lambda scans, nodes, blocks: nodes[0, :1])
     monkeypatch.setattr(hypotheses, 'gain', lambda before, after: Gain(float(after[0] - before[0]), 1.0))
-    # one more, before the first metres, is neither asked nor counted
-    heading = replace(right, certainty=0.65, doubts=((1, 0.05), *((node, 0.1) for node in asked_at)))
+    # one more doubt before the first metres, which is neither examined nor counted
+    heading = replace(right, certainty=0.65, doubts=((1, 0.05), *((node, 0.1) for node in examined_at)))
     for node in lost:
         heading = heading.turned(node, math.pi / 2)
     solver = SimpleNamespace(along_walls=lambda: None)
     found = solve_hypotheses(scans, heading, solver, None, lambda other: solver)
     assert found.heading.correction == pytest.approx(right.correction)
-    # where nothing is recognised all are asked, and those known that are predicted better turned: of several of which
-    # none is, two may make up for each other
-    assert len(solutions) == 1 + 2 * (len(lost) if recognises else len(asked_at))
-    # what is recognised was counted by what matched
+    # if nothing is recognised, all are examined. Those that are better turned are resolved; of several that are not,
+    # two may cancel.
+    assert len(solutions) == 1 + 2 * (len(lost) if recognises else len(examined_at))
+    # recognised places were counted by the matching
     known = [] if recognises else lost
     assert found.certainty == pytest.approx(0.65 + 0.1 * len(known))
-    assert [node for node, _ in found.heading.doubts] == [1, *(node for node in asked_at if node not in known)]
+    assert [node for node, _ in found.heading.doubts] == [1, *(node for node in examined_at if node not in known)]
 
 
-def test_a_doubt_stays_where_no_solution_predicts_readings_better(there_and_back, monkeypatch) -> None:
+def test_doubt_stays_if_no_solution_predicts_readings_better(there_and_back, monkeypatch) -> None:
     _, _, scans, right = there_and_back
 
     def matched(scans, heading, solver, along) -> hypotheses.Solved:
@@ -263,9 +263,7 @@ def test_a_doubt_stays_where_no_solution_predicts_readings_better(there_and_back
 
 
 @pytest.mark.parametrize('turned_at', [(30,), (30, 50)])
-def test_what_predicts_readings_best_as_it_is_is_known_if_it_is_the_only_doubt(
-    there_and_back, monkeypatch, turned_at
-) -> None:
+def test_unturned_solution_resolves_only_a_single_doubt(there_and_back, monkeypatch, turned_at) -> None:
     _, _, scans, right = there_and_back
 
     def matched(scans, heading, solver, along) -> hypotheses.Solved:
@@ -285,8 +283,8 @@ def test_what_predicts_readings_best_as_it_is_is_known_if_it_is_the_only_doubt(
 
 
 @pytest.mark.parametrize('sign', [1.0, -1.0])
-def test_a_drive_and_its_mirror_image_are_turned_alike(there_and_back, monkeypatch, sign) -> None:
-    """Where both ways are better than none, and blocks are recognised both ways, the better one is taken."""
+def test_drive_and_its_mirror_image_are_turned_alike(there_and_back, monkeypatch, sign) -> None:
+    """If both turns are better than none, and blocks are recognised with both, the better one is used."""
     _, _, scans, right = there_and_back
 
     def matched(scans, heading, solver, along) -> hypotheses.Solved:

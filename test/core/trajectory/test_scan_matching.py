@@ -1,4 +1,4 @@
-"""Buildings whose walls stand at any angle: scan matching, and the trajectory that matches alone say."""
+"""Buildings with walls at any angle: scan matching, and trajectories from matches alone."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ from forward_grid_mapper.simulation.world import Floorplan, World
 TRUST = TRUSTS[0]
 
 MIDDLE, RADIUS, HALF = np.array([10.0, 10.0]), 7.0, 0.9
-"""Metres: a corridor along the five sides of a pentagon, whose walls have five directions modulo a right angle."""
+"""Metres: a corridor along the five sides of a pentagon; its walls have five directions modulo a right angle."""
 
 
 def corners(radius: float) -> Floats:
@@ -65,8 +65,8 @@ def pentagon() -> World:
 
 @pytest.fixture(scope='module')
 def exact() -> Recording:
-    way = corners(RADIUS)
-    return drive(pentagon(), np.concatenate([way, way[:4]]), 0.12, sonar_ring(12), NOISY, seed=3)
+    path = corners(RADIUS)
+    return drive(pentagon(), np.concatenate([path, path[:4]]), 0.12, sonar_ring(12), NOISY, seed=3)
 
 
 def bent_by(exact: Recording, level: str, seed: int) -> tuple[Recording, Odometry]:
@@ -80,7 +80,7 @@ def scans_of(recording: Recording, odometry: Odometry) -> Scans:
 
 
 def quietly(part: float) -> None:
-    """Receives how much is done."""
+    """Ignore the progress."""
 
 
 @pytest.fixture(scope='module')
@@ -99,13 +99,13 @@ def matched(scans: Scans) -> Floats:
 
 
 def off_after(nodes: Floats, true: Floats, apart: int = 12) -> Floats:
-    """By how much the motion over so many windows is off, metres, metres and radians."""
+    """Error of the motion over so many windows: metres, metres and radians."""
     off = relative(relative(true[:-apart], true[apart:]), relative(nodes[:-apart], nodes[apart:]))
     off[:, 2] = (off[:, 2] + math.pi) % (2 * math.pi) - math.pi
     return off
 
 
-def test_scan_matching_takes_most_of_the_yaw_out_of_five_metres(exact, scans, matched) -> None:
+def test_scan_matching_reduces_the_yaw_error_over_five_metres(exact, scans, matched) -> None:
     true = odometry_of(exact).at(scans.windows.node_stamp)
     before, after = (np.sqrt((off_after(nodes, true) ** 2).mean(0)) for nodes in (scans.windows.node, matched))
     assert before[2] > math.radians(5.0)
@@ -113,19 +113,19 @@ def test_scan_matching_takes_most_of_the_yaw_out_of_five_metres(exact, scans, ma
     assert np.hypot(*after[:2]) < 0.8 * np.hypot(*before[:2])
 
 
-def test_the_first_windows_stay(scans, matched) -> None:
+def test_first_windows_are_not_moved(scans, matched) -> None:
     np.testing.assert_array_equal(matched[:FIRST], scans.windows.node[:FIRST])
 
 
-def test_what_is_held_out_moves_nothing(scans, matched) -> None:
+def test_held_out_readings_have_no_effect_on_scan_matching(scans, matched) -> None:
     w = scans.windows
-    silent = np.repeat(scans.held_out, np.diff(w.first))
-    spoilt = replace(w, readings=replace(w.readings, z=np.where(silent, 0.5, w.readings.z)))
-    other = Scans(spoilt, for_matching(Parameters()), np.zeros(1, np.uint8), scans.held_out)
+    in_held_out = np.repeat(scans.held_out, np.diff(w.first))
+    spoiled = replace(w, readings=replace(w.readings, z=np.where(in_held_out, 0.5, w.readings.z)))
+    other = Scans(spoiled, for_matching(Parameters()), np.zeros(1, np.uint8), scans.held_out)
     np.testing.assert_array_equal(scan_matched(other, TRUST, quietly), matched)
 
 
-def test_a_drive_that_is_moved_is_matched_the_same(bent, matched) -> None:
+def test_moved_drive_is_matched_the_same(bent, matched) -> None:
     recording, odometry = bent
     home = np.array([3.0, -12.0, math.pi / 2])
     r = recording.readings
@@ -133,11 +133,11 @@ def test_a_drive_that_is_moved_is_matched_the_same(bent, matched) -> None:
     moved = Odometry.of(odometry.stamp, compose(home, odometry.pose))
     windows = cut(replace(r, x=x, y=y, yaw=yaw), moved)
     scans = Scans(windows, for_matching(Parameters()), np.zeros(1, np.uint8), held_out(len(windows)))
-    # maps are made in the frame of a node, wherever that is
+    # maps are made in the frame of a node
     np.testing.assert_allclose(relative(home, scan_matched(scans, TRUST, quietly))[:, :2], matched[:, :2], atol=1e-3)
 
 
-def test_the_mean_of_poses_against_plain_python(scans, matched) -> None:
+def test_mean_of_poses_is_that_of_the_twin(scans, matched) -> None:
     k = FIRST + 10 * BLOCK
     block, nodes = np.arange(k, k + BLOCK), matched[:k]
     motion = relative(scans.windows.node[k - 1], scans.windows.node[block])
@@ -166,15 +166,15 @@ def test_the_mean_of_poses_against_plain_python(scans, matched) -> None:
     assert np.abs(got).max() > 1e-3
 
 
-def test_nothing_to_match_with_is_odometry(scans) -> None:
+def test_scan_matching_without_readings_returns_odometry(scans) -> None:
     w = scans.windows
     empty = Scans(w, for_matching(Parameters()), np.zeros(1, np.uint8), np.ones(len(w), np.bool_))
     np.testing.assert_allclose(scan_matched(empty, TRUST, quietly), w.node, atol=1e-9)
 
 
 @pytest.mark.slow
-def test_a_building_without_right_angles_is_refined(exact, bent) -> None:
-    # five sides would do as four, with odometry that is off by 18° at each corner
+def test_building_without_right_angles_is_refined(exact, bent) -> None:
+    # with five sides taken for four, odometry would be off by 18° at each corner
     (recording, odometry), true = bent, odometry_of(exact)
     outcome = Refiner(Parameters()).run(recording.readings, odometry)
     assert rms_after_alignment(odometry.pose, true.pose) > 0.6
@@ -186,7 +186,7 @@ def test_a_building_without_right_angles_is_refined(exact, bent) -> None:
 
 
 @pytest.mark.slow
-def test_exact_odometry_stays_without_right_angles(exact) -> None:
+def test_exact_odometry_without_right_angles_is_kept(exact) -> None:
     outcome = Refiner(Parameters()).run(exact.readings, odometry_of(exact))
     assert not outcome.accepted
     assert outcome.readings is exact.readings
@@ -196,7 +196,7 @@ def no_walls(self, windows, scans) -> tuple[None, float]:
     return None, 0.0
 
 
-def test_what_readings_do_not_speak_for_is_left(bent, matched, monkeypatch) -> None:
+def test_trajectory_not_supported_by_readings_is_rejected(bent, matched, monkeypatch) -> None:
     recording, odometry = bent
     monkeypatch.setattr(Refiner, '_heading', no_walls)
     monkeypatch.setattr(refinement, 'match_drive', lambda *rest: MatchedDrive(matched, [], np.inf, 1.0))
@@ -206,13 +206,13 @@ def test_what_readings_do_not_speak_for_is_left(bent, matched, monkeypatch) -> N
     assert left.reason == refinement.NO_WALLS + refinement.NOR_MATCHES
 
 
-def test_matching_alone_needs_poses_within_its_windows(bent, matched, monkeypatch) -> None:
+def test_matching_alone_is_not_tried_with_sparse_poses(bent, matched, monkeypatch) -> None:
     recording, odometry = bent
     monkeypatch.setattr(Refiner, '_heading', no_walls)
     monkeypatch.setattr(refinement, 'match_drive', lambda *rest: MatchedDrive(matched, [], np.inf, 1.0))
     monkeypatch.setattr(refinement, 'gain_at_revisits', lambda *rest: Gain(0.1, 0.01))
     assert Refiner(Parameters()).run(recording.readings, odometry).accepted
-    # a pose every metre, as of a recording at 0.5 Hz
+    # one pose a metre, as in a recording at 0.5 Hz
     kept = np.unique(np.searchsorted(odometry.travel, np.arange(0.0, odometry.travel[-1])))
     sparse = Odometry(odometry.stamp[[*kept, -1]], odometry.pose[[*kept, -1]])
     assert refinement.usual_step(sparse) == pytest.approx(1.0, abs=0.05)
@@ -221,14 +221,14 @@ def test_matching_alone_needs_poses_within_its_windows(bent, matched, monkeypatc
     assert left.reason == refinement.NO_WALLS + refinement.too_sparse_words(refinement.usual_step(sparse))
 
 
-def test_the_usual_step_is_that_of_most_of_the_way() -> None:
-    # a hundred small steps where the robot hardly moves, and most of the way in steps of half a metre
+def test_usual_step_is_weighted_by_distance() -> None:
+    # a hundred small steps of a robot that hardly moves, and most of the way in steps of half a metre
     along = np.concatenate([np.arange(101) * 0.01, 1.0 + np.arange(1, 11) * 0.5])
     pose = np.stack([along, np.zeros_like(along), np.zeros_like(along)], axis=1)
     assert refinement.usual_step(Odometry(np.arange(len(along)), pose)) == pytest.approx(0.5)
 
 
-def test_a_drive_too_large_for_cells_of_one_size_keeps_what_walls_say(bent, scans) -> None:
+def test_drive_above_max_cells_keeps_the_trajectory_from_walls(bent, scans) -> None:
     recording, odometry = bent
     drive_of = _Drive(recording.readings, odometry, scans.windows, scans)
     attempt = by_walls(scans, recording, odometry)
@@ -239,83 +239,81 @@ def test_a_drive_too_large_for_cells_of_one_size_keeps_what_walls_say(bent, scan
 
 
 class Trials:
-    """A solver that puts the second half of a drive a metre farther with each round, and what it is asked.
+    """A solver that moves the second half of a drive by a metre in each round, and records its arguments.
 
     Parameters
     ----------
-    said : list of float, float
-        The part of the places that each round recognises, and how well it explains all readings.
+    values : list of float, float
+    The share of recognised places of each round, and its J.
     far : float
-        Metres by which a round moves what it was given.
+    Metres by which a round moves the nodes.
     """
 
-    def __init__(self, monkeypatch, said: list[tuple[float, float]], far: float = 1.0) -> None:
-        self.asked: list[tuple[Floats, float]] = []
+    def __init__(self, monkeypatch, values: list[tuple[float, float]], far: float = 1.0) -> None:
+        self.calls: list[tuple[Floats, float]] = []
         self._far = far
         monkeypatch.setattr(any_angle, 'MatchSolver', self._solver)
         monkeypatch.setattr(any_angle, 'scan_matched', lambda scans, trust, watch: scans.windows.node)
-        monkeypatch.setattr(Scans, 'objective', lambda *rest: said[len(self.asked) - 1][1] if self.asked else 0.0)
-        monkeypatch.setattr(any_angle, 'recognised_part', lambda *rest: said[len(self.asked) - 1][0])
+        monkeypatch.setattr(Scans, 'objective', lambda *rest: values[len(self.calls) - 1][1] if self.calls else 0.0)
+        monkeypatch.setattr(any_angle, 'recognised_part', lambda *rest: values[len(self.calls) - 1][0])
 
     def _solver(self, windows, scans, say, motion: Floats, noise: float, change) -> Trials:
-        self.asked.append((motion, noise))
+        self.calls.append((motion, noise))
         return self
 
     def with_matches(self, solution: Solution) -> tuple[Solution, list]:
         nodes = solution.nodes.copy()
-        np.testing.assert_array_equal(self.asked[-1][0], relative(nodes[:-1], nodes[1:]))
+        np.testing.assert_array_equal(self.calls[-1][0], relative(nodes[:-1], nodes[1:]))
         nodes[len(nodes) // 2 :, 0] += self._far
         return solution_at(nodes, 4), []
 
 
 @pytest.mark.parametrize(
-    ('said', 'rounds'),
+    ('values', 'rounds'),
     [
         ([(0.9, 1.0)], 1),
         ([(0.5, 1.0), (0.9, 2.0)], 2),
-        # where a round explains readings no better another trust is tried
+        # if J does not grow in a round, another trust is tried
         ([(0.5, 1.0), (0.5, 0.5), (0.9, 3.0)], 1),
         ([(0.5, 1.0), (0.5, 2.0), (0.9, 1.5), (0.9, 1.0)], 2),
         ([(0.5, 1.0), (0.5, 1.0), (0.9, 0.5)], 1),
         ([(0.5, 1.0 + k) for k in range(2 * any_angle.ROUNDS)], any_angle.ROUNDS),
     ],
 )
-def test_rounds_go_on_while_places_are_not_recognised_and_readings_explained_better(
-    bent, scans, monkeypatch, said: list[tuple[float, float]], rounds: int
+def test_rounds_continue_while_few_places_are_recognised_and_j_grows(
+    bent, scans, monkeypatch, values: list[tuple[float, float]], rounds: int
 ) -> None:
-    trials = Trials(monkeypatch, said)
+    trials = Trials(monkeypatch, values)
     found = any_angle.match_drive(bent[1], scans, lambda stage: quietly)
     assert found is not None
-    assert len(trials.asked) == len(said)
-    assert found.value == max(value for _, value in said)
+    assert len(trials.calls) == len(values)
+    assert found.value == max(value for _, value in values)
     assert found.nodes[-1, 0] - scans.windows.node[-1, 0] == pytest.approx(rounds)
 
 
-def test_where_no_map_explains_readings_better_than_that_of_odometry_nothing_more_is_tried(
-    bent, scans, monkeypatch
-) -> None:
+def test_without_gain_over_odometry_no_more_rounds_are_tried(bent, scans, monkeypatch) -> None:
     trials = Trials(monkeypatch, [(0.5, -1.0)])
     assert any_angle.match_drive(bent[1], scans, lambda stage: quietly) is None
-    assert len(trials.asked) == 1
+    assert len(trials.calls) == 1
 
 
-def test_a_round_that_moves_nothing_is_the_last(bent, scans, monkeypatch) -> None:
+def test_round_that_moves_nothing_is_the_last(bent, scans, monkeypatch) -> None:
     trials = Trials(monkeypatch, [(0.5, 1.0), (0.5, 2.0)], far=0.01)
     assert any_angle.match_drive(bent[1], scans, lambda stage: quietly) is not None
-    assert len(trials.asked) == len(TRUSTS)
+    assert len(trials.calls) == len(TRUSTS)
 
 
-def test_a_noise_of_odometry_that_is_told_is_the_one_that_is_taken(bent, scans, monkeypatch) -> None:
+def test_given_noise_of_odometry_is_used(bent, scans, monkeypatch) -> None:
     trusts: list[scan_matching.Trust] = []
     trials = Trials(monkeypatch, [(0.5, 1.0 + k) for k in range(4)], far=0.0)
     monkeypatch.setattr(any_angle, 'scan_matched', lambda scans, trust, _: trusts.append(trust) or scans.windows.node)
     for noise in (0.0, 0.01):
         any_angle.match_drive(bent[1], scans, lambda stage: quietly, noise)
     assert trusts == [*TRUSTS, *(trust._replace(yaw=0.01) for trust in TRUSTS)]
-    assert [noise for _, noise in trials.asked] == [any_angle.REMAINING_YAW_NOISE] * 2 + [0.01] * 2
+    assert [noise for _, noise in trials.calls] == [any_angle.REMAINING_YAW_NOISE] * 2 + [0.01] * 2
 
 
-def test_a_drive_is_explained_better_where_it_was_than_where_odometry_has_it(exact, bent, scans) -> None:
+def test_objective_of_the_true_poses_is_larger_than_of_odometry(exact, bent, scans) -> None:
     windows, true = scans.windows, odometry_of(exact).at(scans.windows.node_stamp)
     right = scans.objective(true)
     assert right > scans.objective(windows.node) + 0.05 * len(windows.readings)
@@ -323,7 +321,7 @@ def test_a_drive_is_explained_better_where_it_was_than_where_odometry_has_it(exa
     assert scans.objective(moved) == pytest.approx(right, rel=0.02)
 
 
-def test_a_drive_is_explained_by_the_map_of_its_readings_but_for_those_held_out(scans) -> None:
+def test_objective_is_that_of_the_map_without_held_out_readings(scans) -> None:
     windows = scans.windows
     kept = np.flatnonzero(~np.repeat(scans.held_out, np.diff(windows.first)))
     maps = Mapper(for_matching(Parameters())).run(windows.readings.select(kept))
@@ -331,7 +329,7 @@ def test_a_drive_is_explained_by_the_map_of_its_readings_but_for_those_held_out(
 
 
 @pytest.mark.parametrize('again', [True, False])
-def test_places_seen_before_are_named_where_there_are_any(bent, scans, matched, monkeypatch, again: bool) -> None:
+def test_reason_names_recognised_places_only_with_revisits(bent, scans, matched, monkeypatch, again: bool) -> None:
     recording, odometry = bent
     monkeypatch.setattr(refinement, 'gain_at_revisits', lambda *rest: Gain(0.1, 0.01))
     monkeypatch.setattr(refinement, 'gain_of_objective', lambda *rest: Gain(0.1, 0.01))
@@ -352,13 +350,13 @@ def test_places_seen_before_are_named_where_there_are_any(bent, scans, matched, 
 
 
 def by_walls(scans: Scans, recording: Recording, odometry: Odometry) -> _Attempt:
-    """A trajectory that walls at right angles would give: odometry, which is taken for something else."""
+    """A trajectory as from walls at right angles: odometry under another name."""
     found = Refinement(True, 'walls', recording.readings, odometry, {})
     return _Attempt(found, scans.windows.node)
 
 
 @pytest.mark.parametrize('sigmas', [5.0, 1.0, -5.0])
-def test_matches_alone_are_taken_over_walls_only_if_they_explain_readings_much_better(
+def test_matches_alone_replace_walls_only_with_a_much_larger_j(
     bent, scans, matched, monkeypatch, sigmas: float
 ) -> None:
     recording, odometry = bent
@@ -374,17 +372,17 @@ def test_matches_alone_are_taken_over_walls_only_if_they_explain_readings_much_b
     assert before is attempt.nodes and after is matched
 
 
-def test_what_explains_readings_no_better_than_what_is_known_is_not_looked_for_long(bent, scans, monkeypatch) -> None:
+def test_rounds_end_early_below_the_j_of_a_known_trajectory(bent, scans, monkeypatch) -> None:
     trials, objective = Trials(monkeypatch, [(0.5, 1.0), (0.5, 2.0)]), Scans.objective
     known = scans.windows.node + 1.0
     monkeypatch.setattr(Scans, 'objective', lambda s, nodes: 3.0 if nodes is known else objective(s, nodes))
     for sigmas, rounds in ((1.0, 0), (2.0, 1)):
         monkeypatch.setattr(any_angle, 'gain_over_drive', lambda *rest, by=sigmas: Gain(by, 1.0))
         assert any_angle.match_drive(bent[1], scans, lambda stage: quietly, 0.0, known) is None
-        assert len(trials.asked) == rounds
+        assert len(trials.calls) == rounds
 
 
-def test_scan_matching_predicts_readings_better_than_corners_that_are_taken_for_square_ones(exact, scans) -> None:
+def test_scan_matching_predicts_better_than_corners_taken_for_square(exact, scans) -> None:
     true = odometry_of(exact).at(scans.windows.node_stamp)
     start = scan_matched(scans, TRUST, quietly)
     assert gain_over_drive(scans, as_if_square(true, true), start, quietly).sigmas > any_angle.WORTH_A_TRIAL
@@ -392,7 +390,7 @@ def test_scan_matching_predicts_readings_better_than_corners_that_are_taken_for_
 
 
 def as_if_square(nodes: Floats, true: Floats) -> Floats:
-    """The nodes, turned at every corner of the true way as if it were square."""
+    """The nodes, turned at each corner of the true path as if it was a right angle."""
     corner = np.cumsum(np.abs(np.diff(true[:, 2], prepend=true[0, 2]))) // math.radians(72.0)
     steps = relative(nodes[:-1], nodes[1:])
     steps[:, 2] += np.diff(corner) * math.radians(18.0)
@@ -402,20 +400,20 @@ def as_if_square(nodes: Floats, true: Floats) -> Floats:
     return square
 
 
-def test_a_trajectory_that_contradicts_itself_is_explained_worse_by_many_standard_errors(exact, bent, scans) -> None:
+def test_j_of_a_contradictory_trajectory_is_smaller_by_many_errors(exact, bent, scans) -> None:
     true = odometry_of(exact).at(scans.windows.node_stamp)
-    told = gain_of_objective(scans, scans.windows.node, true)
+    gain_of_true = gain_of_objective(scans, scans.windows.node, true)
     blocks = -(-len(true) // 4)
-    assert told.sigmas > 4.0
-    assert told.mean * blocks == pytest.approx(scans.objective(true) - scans.objective(scans.windows.node))
+    assert gain_of_true.sigmas > 4.0
+    assert gain_of_true.mean * blocks == pytest.approx(scans.objective(true) - scans.objective(scans.windows.node))
     again = gain_of_objective(scans, true, scans.windows.node)
-    assert again.sigmas == pytest.approx(-told.sigmas)
-    # chance alone decides which of two that are as good has the larger J
+    assert again.sigmas == pytest.approx(-gain_of_true.sigmas)
+    # of two equally good trajectories, chance decides which has the larger J
     near = true + np.array([0.0, 0.0, 1e-3]) * np.sin(np.arange(len(true)))[:, None]
     assert abs(gain_of_objective(scans, true, near).sigmas) < 2.3
 
 
-def test_what_windows_have_of_the_objective_is_all_of_it_but_the_prior(scans) -> None:
+def test_objective_of_windows_sums_up_to_all_without_the_prior(scans) -> None:
     value, windows = scans.explained(scans.windows.node)
     assert value == scans.objective(scans.windows.node)
     assert not windows[scans.held_out].any()
@@ -425,12 +423,12 @@ def test_what_windows_have_of_the_objective_is_all_of_it_but_the_prior(scans) ->
     assert windows.sum() != pytest.approx(value, rel=1e-3)
 
 
-def test_turns_that_odometry_does_not_have_are_told_from_those_of_drift(exact, bent, scans) -> None:
+def test_turns_missing_in_odometry_are_distinguished_from_drift(exact, bent, scans) -> None:
     true = odometry_of(exact).at(scans.windows.node_stamp)
     odometry = scans.windows.node
     assert turns_supported(scans, true)
     assert not turns_supported(scans, as_if_square(odometry, true))
-    # nothing is asked where odometry turns as the nodes do
+    # nothing is tested if odometry turns as the nodes do
     assert turns_supported(scans, odometry)
 
 

@@ -1,4 +1,4 @@
-"""Searching from coarse to fine against asking every pose."""
+"""Searching from coarse to fine, compared with evaluating all poses."""
 
 from __future__ import annotations
 
@@ -29,12 +29,12 @@ from forward_grid_mapper.simulation.world import building_tour, building_world
 MODEL = Parameters().model
 NOTHING = UNKNOWN * MODEL.p_hit
 APART = 0.6
-"""Metres between two places."""
+"""Metres between two different places."""
 
 
 @pytest.fixture(scope='module')
 def places() -> list[tuple[LocalMap, Scan, Floats]]:
-    """Maps along a drive, a scan of 2 m of it that is not on each map, and where the scan was taken."""
+    """Maps along a drive, for each a scan of 2 m that is not on it, and the true pose of the scan."""
     recording = drive(building_world(), building_tour()[:12], 0.1, sonar_ring(8), NOISY, seed=2)
     readings, out = recording.readings, []
     robot = np.array([each.pose for each in recording.odometry], float)
@@ -49,7 +49,7 @@ def places() -> list[tuple[LocalMap, Scan, Floats]]:
     return out
 
 
-def test_coarse_grids_are_asked_with_blurred_readings(places, monkeypatch) -> None:
+def test_coarse_grids_are_evaluated_with_blurred_readings(places, monkeypatch) -> None:
     around, scan, true = places[0]
     by = []
     monkeypatch.setattr(searching, 'blurred', lambda scan, more, around: by.append(more) or scan)
@@ -57,14 +57,14 @@ def test_coarse_grids_are_asked_with_blurred_readings(places, monkeypatch) -> No
     assert by == pytest.approx([BLUR * times * STEPS[0] for times in COARSER])
 
 
-def asked_all(scan: Scan, around: LocalMap, guess: Floats, sigma: Floats, reach: Floats) -> Searched:
+def evaluated_all(scan: Scan, around: LocalMap, guess: Floats, sigma: Floats, reach: Floats) -> Searched:
     poses = grid_around(guess, reach, STEPS)
     prior = 0.5 * ((relative(guess, poses) / sigma) ** 2).sum(1)
     return Searched(poses, scores(scan, around, poses, max(len(scan.readings) // EVALUATED, 1)), prior)
 
 
 def second(found: Searched) -> float:
-    """The best value at another place than the best one's."""
+    """The best value at a place away from the best pose."""
     apart = found.poses - found.best
     return float(found.values[np.hypot(apart[:, 0], apart[:, 1]) > APART].max())
 
@@ -73,40 +73,40 @@ SIGMA, REACH = np.array([1.0, 1.0, math.radians(8.0)]), np.array([2.1, 2.1, math
 
 
 @pytest.mark.slow
-def test_a_large_search_finds_what_asking_all_finds(places) -> None:
+def test_large_search_finds_the_best_of_all_poses(places) -> None:
     for around, scan, true in places:
         guess = compose(true, np.array([0.7, -0.5, math.radians(6.0)]))
-        found, right = (each(scan, around, guess, SIGMA, REACH) for each in (search, asked_all))
+        found, right = (each(scan, around, guess, SIGMA, REACH) for each in (search, evaluated_all))
         assert len(found.poses) < 0.3 * len(right.poses)
         assert found.best == pytest.approx(right.best, abs=1e-9)
-        # what fits about as well elsewhere is known too
+        # it knows the second-best place as well
         assert second(found) > second(right) - 3.0
 
 
-def test_a_small_search_asks_all(places) -> None:
+def test_small_search_evaluates_all_poses(places) -> None:
     around, scan, true = places[0]
     reach = np.array([0.3, 0.3, math.radians(7.5)])
-    found, right = (each(scan, around, true, SIGMA, reach) for each in (search, asked_all))
+    found, right = (each(scan, around, true, SIGMA, reach) for each in (search, evaluated_all))
     assert len(right.poses) <= LARGE
     for one, other in zip(found, right, strict=True):
         np.testing.assert_array_equal(one, other)
 
 
-def test_nothing_outside_of_the_reach_is_asked(places) -> None:
+def test_no_poses_out_of_reach_are_evaluated(places) -> None:
     around, scan, true = places[1]
     off = relative(true, search(scan, around, true, SIGMA, REACH).poses)
     assert (np.abs(off) <= REACH + 1e-9).all()
     assert len(np.unique(off.round(6), axis=0)) == len(off)
 
 
-def test_a_direction_that_is_certain_is_not_searched(places) -> None:
+def test_certain_direction_is_not_searched(places) -> None:
     around, scan, true = places[2]
     reach = np.array([2.1, 0.0, math.radians(15.0)])
     off = relative(true, search(scan, around, true, SIGMA, reach).poses)
     assert np.abs(off[:, 1]).max() < 1e-9 and np.abs(off[:, 0]).max() > 1.0
 
 
-def test_a_blurred_scan_is_one_of_a_larger_sigma(places) -> None:
+def test_blurred_scan_has_a_larger_sigma(places) -> None:
     around, scan, true = places[0]
     by = 0.2
     blurry = blurred(scan, by, around)
@@ -116,9 +116,9 @@ def test_a_blurred_scan_is_one_of_a_larger_sigma(places) -> None:
     assert (farther[echo] > 0.0).all() and (farther[~echo] == 0.0).all() and echo.any()
     poses = grid_around(true, np.array([0.3, 0.3, 0.0]), (0.15, 0.15, 0.1))
     sharp, soft = (scores(each, around, poses) for each in (scan, blurry))
-    # it falls less where it is off by a step
+    # its score falls less if it is off by a step
     assert np.ptp(soft) < np.ptp(sharp)
-    # what nobody knows counts nothing still
+    # in unknown space it still scores zero
     far = np.array([[90.0, 9.0, 1.0]])
     assert scores(blurry, around, far) == pytest.approx([0.0], abs=1e-3)
     assert blurred(scan, 0.0, around).readings.tolist() == scan.readings.tolist()

@@ -1,4 +1,4 @@
-"""The pose graph of a drive: what votes of walls may say against odometry."""
+"""The pose graph of a drive: the weight of votes of walls against odometry."""
 
 from __future__ import annotations
 
@@ -17,33 +17,33 @@ from forward_grid_mapper.core.trajectory.walls import SPAN
 from forward_grid_mapper.core.trajectory.windows import Odometry, Windows
 from forward_grid_mapper.simulation.sonar import front_array
 
-STRETCH = (10.0, 22.0)
-"""Metres of progress along which walls say something else."""
+WRONG_PART = (10.0, 22.0)
+"""Metres of progress with wrong votes of walls."""
 
 
 @pytest.fixture(scope='module')
 def exact() -> Tour:
-    """Return a drive whose odometry is right, and what walls say of it."""
+    """Return a drive with exact odometry, and its heading from walls."""
     return tour_with(front_array())
 
 
-def solver_of(exact: tuple[Odometry, Windows, Scans, Heading], said: Heading) -> Solver:
+def solver_of(exact: tuple[Odometry, Windows, Scans, Heading], heading_of_walls: Heading) -> Solver:
     odometry, windows, scans, _ = exact
-    return Solver(odometry, windows, scans, said, quietly)
+    return Solver(odometry, windows, scans, heading_of_walls, quietly)
 
 
 def turned(windows: Windows, nodes: Floats) -> Floats:
-    """Return by how many degrees the nodes of the stretch are turned against odometry, beyond all nodes."""
+    """Return the turn in degrees of the nodes of this part relative to odometry, beyond that of all nodes."""
     off = wrapped(nodes[:, 2] - windows.node[:, 2])
     off = np.degrees(wrapped(off - np.median(off)))
-    within = (windows.node_progress > STRETCH[0]) & (windows.node_progress < STRETCH[1])
+    within = (windows.node_progress > WRONG_PART[0]) & (windows.node_progress < WRONG_PART[1])
     out: Floats = off[within]
     return out
 
 
-def test_an_echo_counts_once(exact) -> None:
+def test_each_echo_has_a_total_weight_of_one(exact) -> None:
     _, windows, _, found = exact
-    # places whose votes an echo has a part in, away from the ends of the drive
+    # places whose votes use an echo, away from the ends of the drive
     inner = (windows.progress > SPAN) & (windows.progress < windows.node_progress[-1] - SPAN)
     at = windows.node_progress[found.at]
     places = (np.abs(windows.progress[inner, None] - at) <= SPAN / 2).sum(1)
@@ -51,18 +51,18 @@ def test_an_echo_counts_once(exact) -> None:
     assert solver_of(exact, found)._yaws.part == YAW_WEIGHT
 
 
-def test_walls_that_say_nothing_else_turn_nothing(exact) -> None:
+def test_walls_that_agree_with_odometry_do_not_turn_the_drive(exact) -> None:
     _, windows, _, found = exact
     nodes = solver_of(exact, found).along_walls().nodes
     assert np.abs(turned(windows, nodes)).mean() < 1.0
 
 
 @pytest.mark.parametrize('degrees', [-4.0, 4.0])
-def test_odometry_that_drifts_little_is_not_turned_by_a_few_places(exact, degrees) -> None:
+def test_accurate_odometry_is_not_turned_by_a_few_wrong_places(exact, degrees) -> None:
     _, windows, _, found = exact
     at = windows.node_progress[found.at]
-    astray = np.where((at > STRETCH[0]) & (at < STRETCH[1]), math.radians(degrees), 0.0)
+    astray = np.where((at > WRONG_PART[0]) & (at < WRONG_PART[1]), math.radians(degrees), 0.0)
     drifts = found.drifts._replace(noise=math.radians(0.5))
-    said = replace(found, measured=found.correction + astray, drifts=drifts)
-    nodes = solver_of(exact, said).along_walls().nodes
+    heading_of_walls = replace(found, measured=found.correction + astray, drifts=drifts)
+    nodes = solver_of(exact, heading_of_walls).along_walls().nodes
     assert np.abs(turned(windows, nodes)).mean() < abs(degrees) / 2

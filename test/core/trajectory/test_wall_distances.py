@@ -1,4 +1,4 @@
-"""Distances of straight walls: against plain Python, and in a corridor whose walls are known."""
+"""Distances of straight walls, compared with plain Python and in a corridor with known walls."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ LENGTH, HALF = 16.0, 0.13
 def corridor(recess: float = 0.0, noise: float = 0.0, slant: float = 0.0) -> Windows:
     """A straight drive between walls at y = −0.8 and 1.2, the second one set back from 8 m on; the end is at 18 m.
 
-    The edges of the cones that look to the sides meet the walls at a slant, if one is given: they look more ahead.
+    With a slant, the cones are turned ahead, and the edges of those that look to the sides see the walls.
     """
     rng = np.random.default_rng(2)
     x = np.arange(0.0, LENGTH, 0.1)
@@ -63,32 +63,32 @@ def measured(windows: Windows, nodes: np.ndarray | None = None) -> Distances:
     return Distances(windows, np.zeros(len(windows), bool), windows.node if nodes is None else nodes)
 
 
-def test_distances_are_those_of_the_walls() -> None:
+def test_measured_distances_are_those_of_the_walls() -> None:
     windows = corridor(noise=0.01)
     found = measured(windows)
     for direction, wanted in ((1, 1.2), (3, 0.8)):
         mine = found.direction == direction
         assert mine.sum() > 10
         assert found.distance[mine] == pytest.approx(wanted, abs=0.02)
-    # the end of the corridor counts from 5 m on
+    # the end of the corridor is measured from 5 m on
     ahead = found.direction == 0
     assert found.distance[ahead] == pytest.approx(18.0 - windows.node[found.node[ahead], 0], abs=0.02)
     assert 2.0 < found.distance[ahead].min() < found.distance[ahead].max() < 5.0
     assert not (found.direction == 2).any()
 
 
-def test_walls_that_all_cones_look_past_are_heard_by_their_edges() -> None:
+def test_walls_beside_all_cones_are_measured_by_their_edges() -> None:
     found = measured(corridor(noise=0.01, slant=math.radians(20.0)))
     for direction, wanted in ((1, 1.2), (3, 0.8)):
         mine = found.direction == direction
         assert mine.sum() > 10
         assert found.distance[mine] == pytest.approx(wanted, abs=0.02)
-    # farther beside the cones nothing is looked for
+    # farther beside the cones nothing is measured
     beyond = measured(corridor(noise=0.01, slant=math.radians(32.0)))
     assert not np.isin(beyond.direction, (1, 3)).any()
 
 
-def test_each_wall_is_one_and_one_that_is_set_back_is_another() -> None:
+def test_wall_that_is_set_back_is_another_wall() -> None:
     for recess, wanted in ((0.0, 3), (0.3, 4)):
         walls = measured(corridor(recess)).walls(strict=True)
         assert walls.total == wanted
@@ -101,10 +101,10 @@ def test_each_wall_is_one_and_one_that_is_set_back_is_another() -> None:
 
 
 @pytest.mark.parametrize('slant', [0.0, 0.3])
-def test_the_lever_is_the_change_with_the_yaw(slant: float) -> None:
+def test_lever_is_the_derivative_by_the_yaw(slant: float) -> None:
     windows = corridor(slant=slant)
     turn = 0.002
-    # all of the drive turned about each node in turn is what the lever tells of the echoes around that node
+    # turn the whole drive about each node: the lever predicts the change of its distances
     one = measured(windows)
     for k in range(len(one.node)):
         middle = windows.node[one.node[k]]
@@ -115,7 +115,7 @@ def test_the_lever_is_the_change_with_the_yaw(slant: float) -> None:
     assert np.abs(one.lever).max() > 0.1
 
 
-def test_nodes_that_are_moved_measure_the_same_distances() -> None:
+def test_moved_nodes_measure_the_same_distances() -> None:
     windows = corridor()
     home = np.array([3.0, -1.0, math.pi / 2])
     one, other = measured(windows), measured(windows, compose(home, windows.node))
@@ -125,7 +125,7 @@ def test_nodes_that_are_moved_measure_the_same_distances() -> None:
 
 
 def bent_drive(bearings: np.ndarray, halves: np.ndarray, seed: int) -> Windows:
-    """A drive along a bend in a room of 9 m by 5 m, whose rough walls each cone hears where it meets them first."""
+    """A drive along a bend in a room of 9 m by 5 m; each cone has its range to the nearest point of the rough walls."""
     rng = np.random.default_rng(seed)
     along = np.arange(0.0, 1.0, 0.01)
     pose = np.column_stack([1.0 + 6.0 * along, 1.2 + 1.5 * along**2, 0.1 + 0.4 * along])
@@ -155,16 +155,16 @@ def bent_drive(bearings: np.ndarray, halves: np.ndarray, seed: int) -> Windows:
 
 
 def mirrored(windows: Windows) -> Windows:
-    """The same drive with left and right exchanged."""
+    """The drive with left and right exchanged."""
     w, flip = windows, np.array([1.0, -1.0, -1.0])
     readings = dataclasses.replace(w.readings, y=-w.readings.y, yaw=-w.readings.yaw)
     return dataclasses.replace(w, readings=readings, robot=w.robot * flip, mount=w.mount * flip, node=w.node * flip)
 
 
 @pytest.mark.parametrize('seed', range(8))
-def test_a_mirrored_drive_has_the_mirrored_votes_and_distances(seed: int) -> None:
+def test_mirrored_drive_has_mirrored_votes_and_distances(seed: int) -> None:
     rng = np.random.default_rng(seed)
-    # sensors to all directions but straight to a side, or any, some of them with wide cones
+    # sensors in all directions except straight to a side, or in any; some have wide cones
     bearings = np.radians(rng.choice([-150, -118, -60, -35, 10, 25, 62, 125, 170] if seed < 6 else np.arange(360), 6))
     windows = bent_drive(bearings, np.radians(rng.uniform(5.0, 12.0 if seed < 6 else 50.0, 6)), seed)
     other, everywhere = mirrored(windows), np.zeros(len(windows), bool)
@@ -190,7 +190,7 @@ def test_held_out_windows_measure_nothing() -> None:
     assert Distances(windows, np.ones(len(windows), bool), windows.node).walls(strict=False).total == 0
 
 
-def test_agreeing_echoes_are_those_of_plain_python() -> None:
+def test_agreeing_echoes_are_those_of_the_twin() -> None:
     rng = np.random.default_rng(4)
     for _ in range(50):
         distance = np.round(rng.choice([1.0, 2.0, 2.1], 14) + rng.normal(0, 0.04, 14), 4)
@@ -208,7 +208,7 @@ def test_agreeing_echoes_are_those_of_plain_python() -> None:
             assert not set(first[0]) & set(first[1])
 
 
-def test_noise_is_told_from_what_each_wall_says() -> None:
+def test_noise_is_estimated_from_deviations_within_walls() -> None:
     rng = np.random.default_rng(6)
     wall = np.repeat(np.arange(40), 8)
     place = wall * 1.7 + rng.normal(0, 0.03, len(wall))
@@ -218,7 +218,7 @@ def test_noise_is_told_from_what_each_wall_says() -> None:
     assert noise_of(np.arange(5), np.arange(5.0)) == FIRST_SIGMA
 
 
-def test_normals_are_right_angles() -> None:
+def test_normals_are_at_right_angles() -> None:
     angle = np.arange(4) * math.pi / 2
     for wall_angle in (np.zeros(4), np.array([0.1, -0.2, 0.3, 1.4])):
         wanted = np.stack([np.cos(angle + wall_angle), np.sin(angle + wall_angle)], 1)
@@ -226,11 +226,11 @@ def test_normals_are_right_angles() -> None:
 
 
 def ahead(*bearings: float, yaw: float = 0.0) -> Windows:
-    """A drive straight up to a rough wall at x = 8 m; of these sonars those that look at it, or to a side, are deaf."""
+    """A drive straight towards a rough wall at x = 8 m; sonars that look at it or to a side have no echo."""
     half, x = math.radians(7.5), np.arange(0.0, 6.0, 0.1)
     stamp, count = (np.arange(len(x)) * 1e8).astype(np.int64), len(bearings)
     bearing, at = np.tile(bearings, len(x)), np.repeat(x, count)
-    # what a cone meets first is its edge
+    # the edge of the cone sees the wall first
     deaf = (bearing == 0.0) | (np.abs(bearing) > 1.0)
     z = np.where(deaf, np.inf, (8.0 - at) / np.cos(np.maximum(np.abs(bearing) - half, 0.0)))
     readings = Readings.from_columns(
@@ -247,7 +247,7 @@ def ahead(*bearings: float, yaw: float = 0.0) -> Windows:
 
 
 @pytest.mark.parametrize(('past', 'heard'), [(5.0, True), (10.0, True), (10.4, True), (12.0, False)])
-def test_a_wall_ahead_is_heard_by_cones_that_look_past_it(past, heard) -> None:
+def test_wall_ahead_is_measured_by_cones_beside_it(past, heard) -> None:
     sides = math.radians(past), -math.radians(past)
     windows = ahead(*sides, math.pi / 2)
     found = measured(windows)
@@ -255,29 +255,29 @@ def test_a_wall_ahead_is_heard_by_cones_that_look_past_it(past, heard) -> None:
     assert found.distance == pytest.approx(8.0 - windows.node[found.node, 0], abs=1e-6)
     walls = found.walls(strict=True)
     assert walls.total == heard
-    # beside the robot only cones that hold the normal are asked, and so they are if there is one that looks ahead
+    # beside the robot only cones that contain the normal are used, also with a sensor that looks ahead
     yaw = AHEAD + 0.1
     for other in (ahead(*sides, math.pi / 2 + yaw, yaw=yaw), ahead(*sides, math.pi / 2, 0.0)):
         assert len(measured(other).node) == (len(found.node) if past < 7.5 else 0)
 
 
-def test_a_robot_without_a_sensor_to_a_side_hears_what_is_far_beside_its_cones() -> None:
+def test_without_sensors_to_a_side_walls_far_beside_cones_are_measured() -> None:
     for past, heard in ((12.0, True), (36.0, True), (39.0, False)):
         assert bool(len(measured(ahead(math.radians(past), -math.radians(past))).node)) == heard
 
 
-def test_what_one_cone_hears_beside_it_is_no_wall_if_there_is_one_on_its_other_side() -> None:
+def test_wall_beside_one_cone_needs_the_cone_on_its_other_side() -> None:
     past = math.radians(20.0)
     both, one = ahead(past, -past), ahead(past, -past)
     silent = np.where(one.mount[:, 2] < 0.0, one.readings.z_max, one.readings.z)
     one = dataclasses.replace(one, readings=dataclasses.replace(one.readings, z=silent))
     assert len(measured(both).node) > 0
     assert len(measured(one).node) == 0
-    # without a cone on the other side nothing better is to be had
+    # without a cone on the other side, there is nothing better
     assert len(measured(ahead(past)).node) > 0
 
 
-def test_the_lever_of_a_wall_ahead_is_the_change_with_the_yaw() -> None:
+def test_lever_of_a_wall_ahead_is_the_derivative_by_the_yaw() -> None:
     windows, turn = ahead(math.radians(10.0)), 0.002
     one = measured(windows)
     for k in range(len(one.node)):

@@ -1,4 +1,4 @@
-"""Windows of a drive: nodes in their middles, one behind the other, wherever the robot stood."""
+"""Windows of a drive: nodes are in the middle of windows and in order, also after standstills."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from forward_grid_mapper.core.trajectory.windows import Odometry, corrected, cut
 
 
 def driven(steps: list[tuple[float, float]]) -> tuple[Readings, Odometry]:
-    """A drive along x in steps of seconds and metres, and a reading of each of two sensors at every pose."""
+    """A drive along x in steps of (seconds, metres), with a reading of each of two sensors at each pose."""
     seconds, metres = np.cumsum([(0.0, 0.0), *steps], axis=0).T
     stamp = np.round(seconds * 1e9).astype(np.int64)
     odometry = Odometry.of(stamp, np.stack([metres, 0.0 * metres, 0.0 * metres], axis=1))
@@ -22,19 +22,19 @@ def driven(steps: list[tuple[float, float]]) -> tuple[Readings, Odometry]:
 
 @pytest.mark.parametrize('last', [0.3, 0.6, 0.9, 1.3])
 @pytest.mark.parametrize('stop', [0, 100])
-def test_no_two_nodes_fall_together_where_the_robot_stood(last: float, stop: int) -> None:
+def test_nodes_are_distinct_after_a_standstill(last: float, stop: int) -> None:
     readings, odometry = driven([(0.1, 0.02)] * 100 + [(0.1, 0.0)] * stop + [(0.1, last)])
     windows = cut(readings, odometry)
     assert (np.diff(windows.node_progress) > 0.0).all()
     middle = 0.2 + 0.4 * np.arange(len(windows))
     assert windows.node[:-3, 0] == pytest.approx(middle[:-3], abs=1e-6)
-    # one of them may be where the robot stood
+    # one of them may be at the standstill
     assert (np.abs(windows.node[-3:, 0] - middle[-3:]) > 1e-6).sum() <= (stop > 0)
     same = corrected(odometry.progress, odometry.pose, windows.node_progress, windows.node, windows.node)
     assert same == pytest.approx(odometry.pose, abs=1e-9)
 
 
-def test_nodes_of_slow_odometry_lie_on_the_way() -> None:
+def test_nodes_of_slow_odometry_are_on_the_path() -> None:
     rng = np.random.default_rng(3)
     for _ in range(20):
         steps = [(1.0, 0.8 * float(moves)) for moves in rng.random(60) < 0.5]
