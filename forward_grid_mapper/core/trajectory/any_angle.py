@@ -2,6 +2,10 @@
 
 A bent trajectory has bent local maps, and few places are recognised on them. So blocks are matched and loops are closed
 again with the result in place of odometry, as long as J of the map of the whole drive grows.
+
+Local maps are scaled as the trajectory is, so matches confirm a wrong scale of the wheels. The map of the whole drive
+does not: ranges are in metres, and walls are blurred if they do not agree with the way between the places they were
+measured from. So the trajectory is scaled as a whole if J becomes clearly larger.
 """
 
 from __future__ import annotations
@@ -10,7 +14,10 @@ import math
 from collections.abc import Callable
 from typing import NamedTuple
 
-from .judging import gain_over_drive
+import numpy as np
+
+from .holding_out import LEAST_SIGMAS
+from .judging import gain_of_objective, gain_over_drive
 from .loops import Loop
 from .odometry_model import CALIBRATION, sensitivity
 from .passes import Progress
@@ -32,6 +39,10 @@ others."""
 
 ROUNDS = 4
 """Most rounds of matching and loop closing."""
+
+SCALE_STEP, MOST_STEPS = 1.03, 5
+"""Factor from one scale to the next that is tried after a round, and number of steps in either direction at which the
+search ends without a result. J is noisy, and does not show smaller steps."""
 
 
 class MatchedDrive(NamedTuple):
@@ -109,6 +120,35 @@ def _match_repeatedly(
         if found.value <= least:
             break
         best, least = found, found.value
+        scaled = _scaled(scans, nodes)
+        if scaled is not nodes:
+            best = found._replace(nodes=scaled, value=scans.objective(scaled))
+            nodes, least = scaled, best.value
+            # further matches would take some of it back
+            change[:, :, 0] = 0.0
+            continue
         if found.part >= LEAST_RECOGNISED or rms_after_alignment(before, nodes) < SETTLED:
             break
     return best
+
+
+def _scaled(scans: Scans, nodes: Floats) -> Floats:
+    """Return the trajectory at the scale of the largest J if that is clearly larger, otherwise `nodes` itself."""
+
+    def at(steps: float) -> Floats:
+        out = nodes.copy()
+        out[:, :2] = nodes[0, :2] + SCALE_STEP**steps * (nodes[:, :2] - nodes[0, :2])
+        return out
+
+    values = {step: scans.objective(at(step)) for step in (0, -1, 1)}
+    top = max(values, key=values.__getitem__)
+    while top in (min(values), max(values)) and abs(top) < MOST_STEPS:
+        beyond = top + int(np.sign(top))
+        values[beyond] = scans.objective(at(beyond))
+        top = max(values, key=values.__getitem__)
+    if top in (min(values), max(values)):
+        return nodes
+    before, here, after = (values[top + step] for step in (-1, 0, 1))
+    curvature = 2.0 * here - before - after
+    scaled = at(top + 0.5 * (after - before) / curvature if curvature else top)
+    return scaled if gain_of_objective(scans, nodes, scaled).sigmas >= LEAST_SIGMAS else nodes

@@ -18,6 +18,7 @@ from forward_grid_mapper.core.trajectory.holding_out import Gain, held_out
 from forward_grid_mapper.core.trajectory.judging import gain_of_objective, gain_over_drive, turns_supported
 from forward_grid_mapper.core.trajectory.likelihood import scores
 from forward_grid_mapper.core.trajectory.local_map import for_matching
+from forward_grid_mapper.core.trajectory.odometry_model import CALIBRATION
 from forward_grid_mapper.core.trajectory.outcome import Refinement
 from forward_grid_mapper.core.trajectory.pose_graph import Solution, solution_at
 from forward_grid_mapper.core.trajectory.poses import Floats, compose, relative, rms_after_alignment
@@ -259,6 +260,7 @@ class Trials:
 
     def _solver(self, windows, scans, say, motion: Floats, noise: float, change) -> Trials:
         self.calls.append((motion, noise))
+        self.change = change
         return self
 
     def with_matches(self, solution: Solution) -> tuple[Solution, list]:
@@ -445,3 +447,31 @@ def test_scan_matching_can_be_cancelled(bent, monkeypatch) -> None:
     with pytest.raises(Cancelled):
         refiner.run(recording.readings, odometry, watch)
     assert stages[-1] == 'scan matching'
+
+
+@pytest.mark.parametrize('factor', [0.9, 1.1])
+def test_wrong_scale_of_a_drive_is_found_by_its_objective(exact, scans, factor: float) -> None:
+    true = odometry_of(exact).at(scans.windows.node_stamp)
+    wrong = np.column_stack([factor * true[:, :2], true[:, 2]])
+    found = any_angle._scaled(scans, wrong)
+    scale = np.hypot(*(found[-1, :2] - found[0, :2])) / np.hypot(*(true[-1, :2] - true[0, :2]))
+    assert scale == pytest.approx(1.0, abs=0.02)
+    assert np.array_equal(found[0], wrong[0])
+    assert np.array_equal(found[:, 2], wrong[:, 2])
+
+
+def test_right_scale_of_a_drive_is_kept(exact, scans) -> None:
+    true = odometry_of(exact).at(scans.windows.node_stamp)
+    assert any_angle._scaled(scans, true) is true
+
+
+def test_next_round_holds_the_scale_that_was_found(bent, scans, monkeypatch) -> None:
+    trials = Trials(monkeypatch, [(0.9, 1.0), (0.9, 2.0)], far=0.0)
+    larger = scans.windows.node * [1.05, 1.05, 1.0]
+    monkeypatch.setattr(any_angle, '_scaled', lambda _, nodes: larger if len(trials.calls) == 1 else nodes)
+    found = any_angle.match_drive(bent[1], scans, lambda stage: quietly)
+    assert found is not None
+    assert len(trials.calls) == 2
+    assert found.nodes == pytest.approx(larger)
+    assert not trials.change[:, :, CALIBRATION.index('scale')].any()
+    assert trials.change[:, :, CALIBRATION.index('bias')].any()
