@@ -5,6 +5,7 @@
     python benchmarks/trajectories.py --maps                # with scores of the maps
     python benchmarks/trajectories.py --shared ../shared/data
     python benchmarks/trajectories.py --drawn 12            # buildings of many materials, drawn at random
+    python benchmarks/trajectories.py --simulators --maps   # places like the worlds of well-known simulators
     python benchmarks/trajectories.py --distance 250 500 1000    # growth of time and memory
 
 Each run prints the absolute trajectory error (rms after rigid alignment, metres) of odometry and of the result of
@@ -20,6 +21,7 @@ import dataclasses
 import math
 import resource
 import time
+from collections.abc import Callable
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -27,6 +29,7 @@ from typing import Any
 import numpy as np
 from material_worlds import building_drive
 from quality_worlds import scoring_tool
+from simulator_worlds import PLACES
 
 from forward_grid_mapper.core.common.grid import UNKNOWN
 from forward_grid_mapper.core.common.parameters import Parameters
@@ -173,12 +176,14 @@ def add_map_scores(row: dict[str, Any], exact: Recording, drifted: Recording) ->
     print(f'{"":<34} F1 ' + ', '.join(f'{name} {row[name]:.3f}' for name in placed), flush=True)
 
 
-def simulated(robot: str, level: str, seeds: range, first: int, maps: bool) -> list[dict[str, Any]]:
-    """Run the simulated worlds of one robot and level."""
+def simulated(
+    robot: str, level: str, seeds: range, maps: bool, worlds_of: Callable[[int], dict[str, tuple[World, np.ndarray]]]
+) -> list[dict[str, Any]]:
+    """Run one robot and level in the worlds of each seed."""
     sonars, spacing, noise = ROBOTS[robot]
     rows = []
-    for seed in range(first, first + len(seeds)):
-        for name, (world, way) in worlds(seed).items():
+    for seed in seeds:
+        for name, (world, way) in worlds_of(seed).items():
             exact = drive(world, way, spacing, sonars(), noise, seed)
             recording = with_drift(exact, LEVELS[level], seed) if level != 'none' else exact
             title = f'{robot}, {level}, {name}, seed {seed}'
@@ -275,6 +280,7 @@ def main() -> None:
     parser.add_argument('--maps', action='store_true', help='score the maps of simulated runs, too')
     parser.add_argument('--shared', type=Path, help='folder of recordings with corrected odometry, instead')
     parser.add_argument('--drawn', type=int, help='so many buildings drawn at random, instead')
+    parser.add_argument('--simulators', action='store_true', help='places like the worlds of simulators, instead')
     parser.add_argument('--distance', type=float, nargs='+', help='metres of longer and longer drives, instead')
     options = parser.parse_args()
     warm_up()
@@ -291,9 +297,11 @@ def main() -> None:
             rows = drawn(level, range(options.first_seed, options.first_seed + options.drawn))
             summary(f'drawn, {level}', rows)
         return
+    seeds = range(options.first_seed, options.first_seed + options.seeds)
+    worlds_of = (lambda seed: {name: place() for name, place in PLACES.items()}) if options.simulators else worlds
     for robot in options.robot or ROBOTS:
         for level in options.level or ('none', *LEVELS):
-            rows = simulated(robot, level, range(options.seeds), options.first_seed, options.maps)
+            rows = simulated(robot, level, seeds, options.maps, worlds_of)
             summary(f'{robot}, {level}', rows)
 
 

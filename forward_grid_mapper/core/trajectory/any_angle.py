@@ -40,9 +40,9 @@ others."""
 ROUNDS = 4
 """Most rounds of matching and loop closing."""
 
-SCALE_STEP, MOST_STEPS = 1.03, 5
-"""Factor from one scale to the next that is tried after a round, and number of steps in either direction at which the
-search ends without a result. J is noisy, and does not show smaller steps."""
+SCALE_STEP, LEAST_STEPS, MOST_STEPS = 1.03, 0.5, 5
+"""Factor from one scale to the next that is tried after a round, fewest steps by which the scale is changed, since J is
+noisy, and number of steps at which the search ends without a result."""
 
 
 class MatchedDrive(NamedTuple):
@@ -111,7 +111,7 @@ def _match_repeatedly(
 ) -> MatchedDrive | None:
     """Return the best result of repeated matching, each round from the result before; None if J is at most `least`."""
     change, nodes = sensitivity(odometry, scans.windows), start
-    best = None
+    best, may_scale = None, True
     for _ in range(ROUNDS):
         solver = MatchSolver(scans.windows, scans, start_stage, relative(nodes[:-1], nodes[1:]), noise, change)
         solution, loops = solver.with_matches(solution_at(nodes, len(CALIBRATION)))
@@ -120,8 +120,9 @@ def _match_repeatedly(
         if found.value <= least:
             break
         best, least = found, found.value
-        scaled = _scaled(scans, nodes)
-        if scaled is not nodes:
+        scaled = _scaled(scans, nodes, found.value) if may_scale else nodes
+        may_scale = scaled is not nodes
+        if may_scale:
             best = found._replace(nodes=scaled, value=scans.objective(scaled))
             nodes, least = scaled, best.value
             # further matches would take some of it back
@@ -132,15 +133,18 @@ def _match_repeatedly(
     return best
 
 
-def _scaled(scans: Scans, nodes: Floats) -> Floats:
-    """Return the trajectory at the scale of the largest J if that is clearly larger, otherwise `nodes` itself."""
+def _scaled(scans: Scans, nodes: Floats, value: float) -> Floats:
+    """Return the trajectory at the scale of the largest J if that is clearly larger than `value`, otherwise `nodes`.
+
+    `value` is J of `nodes`, nats.
+    """
 
     def at(steps: float) -> Floats:
         out = nodes.copy()
         out[:, :2] = nodes[0, :2] + SCALE_STEP**steps * (nodes[:, :2] - nodes[0, :2])
         return out
 
-    values = {step: scans.objective(at(step)) for step in (0, -1, 1)}
+    values = {0: value, **{step: scans.objective(at(step)) for step in (-1, 1)}}
     top = max(values, key=values.__getitem__)
     while top in (min(values), max(values)) and abs(top) < MOST_STEPS:
         beyond = top + int(np.sign(top))
@@ -150,5 +154,8 @@ def _scaled(scans: Scans, nodes: Floats) -> Floats:
         return nodes
     before, here, after = (values[top + step] for step in (-1, 0, 1))
     curvature = 2.0 * here - before - after
-    scaled = at(top + 0.5 * (after - before) / curvature if curvature else top)
+    steps = top + 0.5 * (after - before) / curvature if curvature else top
+    if abs(steps) < LEAST_STEPS:
+        return nodes
+    scaled = at(steps)
     return scaled if gain_of_objective(scans, nodes, scaled).sigmas >= LEAST_SIGMAS else nodes

@@ -453,7 +453,7 @@ def test_scan_matching_can_be_cancelled(bent, monkeypatch) -> None:
 def test_wrong_scale_of_a_drive_is_found_by_its_objective(exact, scans, factor: float) -> None:
     true = odometry_of(exact).at(scans.windows.node_stamp)
     wrong = np.column_stack([factor * true[:, :2], true[:, 2]])
-    found = any_angle._scaled(scans, wrong)
+    found = any_angle._scaled(scans, wrong, scans.objective(wrong))
     scale = np.hypot(*(found[-1, :2] - found[0, :2])) / np.hypot(*(true[-1, :2] - true[0, :2]))
     assert scale == pytest.approx(1.0, abs=0.02)
     assert np.array_equal(found[0], wrong[0])
@@ -462,13 +462,13 @@ def test_wrong_scale_of_a_drive_is_found_by_its_objective(exact, scans, factor: 
 
 def test_right_scale_of_a_drive_is_kept(exact, scans) -> None:
     true = odometry_of(exact).at(scans.windows.node_stamp)
-    assert any_angle._scaled(scans, true) is true
+    assert any_angle._scaled(scans, true, scans.objective(true)) is true
 
 
 def test_next_round_holds_the_scale_that_was_found(bent, scans, monkeypatch) -> None:
     trials = Trials(monkeypatch, [(0.9, 1.0), (0.9, 2.0)], far=0.0)
     larger = scans.windows.node * [1.05, 1.05, 1.0]
-    monkeypatch.setattr(any_angle, '_scaled', lambda _, nodes: larger if len(trials.calls) == 1 else nodes)
+    monkeypatch.setattr(any_angle, '_scaled', lambda _, nodes, value: larger if len(trials.calls) == 1 else nodes)
     found = any_angle.match_drive(bent[1], scans, lambda stage: quietly)
     assert found is not None
     assert len(trials.calls) == 2
