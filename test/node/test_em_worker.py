@@ -104,6 +104,8 @@ def test_failed_start_of_the_thread_gives_an_outcome(monkeypatch: pytest.MonkeyP
         assert "can't start new thread" in caller.outcome_of().message
     assert "can't start new thread" in caller.worker.worker.trouble
     assert caller.outcome_of().maps is not None
+    # the outcome comes from the task, which has not ended yet
+    caller.worker.worker.ask(lambda: None)
     assert caller.worker.worker.trouble == ''
 
 
