@@ -16,6 +16,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from ..common.errors import InputError
 from .holding_out import LEAST_SIGMAS
 from .judging import gain_of_objective, gain_over_drive
 from .loops import Loop
@@ -144,17 +145,24 @@ def _scaled(scans: Scans, nodes: Floats, value: float) -> Floats:
         out[:, :2] = nodes[0, :2] + SCALE_STEP**steps * (nodes[:, :2] - nodes[0, :2])
         return out
 
-    values = {0: value, **{step: scans.objective(at(step)) for step in (-1, 1)}}
+    def objective(steps: int) -> float:
+        try:
+            return scans.objective(at(steps))
+        except InputError:
+            # the map of a larger trajectory may be too large
+            return -math.inf
+
+    values = {0: value, **{step: objective(step) for step in (-1, 1)}}
     top = max(values, key=values.__getitem__)
     while top in (min(values), max(values)) and abs(top) < MOST_STEPS:
         beyond = top + int(np.sign(top))
-        values[beyond] = scans.objective(at(beyond))
+        values[beyond] = objective(beyond)
         top = max(values, key=values.__getitem__)
     if top in (min(values), max(values)):
         return nodes
     before, here, after = (values[top + step] for step in (-1, 0, 1))
     curvature = 2.0 * here - before - after
-    steps = top + 0.5 * (after - before) / curvature if curvature else top
+    steps = top + 0.5 * (after - before) / curvature if 0.0 < curvature < math.inf else top
     if abs(steps) < LEAST_STEPS:
         return nodes
     scaled = at(steps)

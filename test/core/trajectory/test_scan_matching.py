@@ -9,7 +9,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from forward_grid_mapper.core.common.errors import Cancelled
+from forward_grid_mapper.core.common.errors import Cancelled, InputError
 from forward_grid_mapper.core.common.parameters import Parameters
 from forward_grid_mapper.core.mapping import Mapper
 from forward_grid_mapper.core.trajectory import any_angle, refinement, scan_matching
@@ -463,6 +463,21 @@ def test_wrong_scale_of_a_drive_is_found_by_its_objective(exact, scans, factor: 
 def test_right_scale_of_a_drive_is_kept(exact, scans) -> None:
     true = odometry_of(exact).at(scans.windows.node_stamp)
     assert any_angle._scaled(scans, true, scans.objective(true)) is true
+
+
+def test_scale_whose_map_would_be_too_large_is_not_taken(exact, scans, monkeypatch) -> None:
+    true = odometry_of(exact).at(scans.windows.node_stamp)
+    wrong, objective = np.column_stack([0.9 * true[:, :2], true[:, 2]]), Scans.objective
+    widest = np.ptp(wrong[:, 0]) * 1.05
+
+    def limited(s: Scans, nodes: Floats) -> float:
+        if np.ptp(nodes[:, 0]) > widest:
+            raise InputError('the map would be too large')
+        return objective(s, nodes)
+
+    monkeypatch.setattr(Scans, 'objective', limited)
+    found = any_angle._scaled(scans, wrong, objective(scans, wrong))
+    assert np.ptp(found[:, 0]) == pytest.approx(np.ptp(wrong[:, 0]) * any_angle.SCALE_STEP)
 
 
 def test_next_round_holds_the_scale_that_was_found(bent, scans, monkeypatch) -> None:
