@@ -69,6 +69,20 @@ def test_gain_near_a_threshold_is_that_of_all_blocks(monkeypatch: pytest.MonkeyP
         assert better == gain(np.zeros(JUDGED_ON), values[starts])
 
 
+@pytest.mark.parametrize(('sigmas', 'compared'), [(3.3, JUDGED_ON // FIRST), (2.7, JUDGED_ON)])
+def test_gain_of_a_third_counts_for_its_expectation_over_all(
+    monkeypatch: pytest.MonkeyPatch, sigmas: float, compared: int
+) -> None:
+    # the threshold is 2.3; of s standard errors, all blocks are expected to have 1.73 s, and 2 σ are 2.83
+    starts = [int(block[0]) for block in judging.blocks_of(WINDOWS, BLOCK, JUDGED_ON)]
+    signs = np.where(np.arange(JUDGED_ON) // FIRST % 2, 1.0, -1.0)
+    values = np.zeros(WINDOWS)
+    values[starts] = signs + sigmas * signs[::FIRST].std(ddof=1) / np.sqrt(JUDGED_ON // FIRST)
+    prediction = Prediction(monkeypatch)
+    gain_over_drive(prediction.scans, nodes_of(np.zeros(WINDOWS)), nodes_of(values), quietly)
+    assert len(prediction.blocks) == compared
+
+
 def test_few_blocks_are_all_compared(monkeypatch: pytest.MonkeyPatch) -> None:
     count = BLOCK * (3 * judging.FEWEST_FIRST - 3)
     prediction = Prediction(monkeypatch)

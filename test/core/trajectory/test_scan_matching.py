@@ -465,6 +465,41 @@ def test_right_scale_of_a_drive_is_kept(exact, scans) -> None:
     assert any_angle._scaled(scans, true, scans.objective(true)) is true
 
 
+class Scaled:
+    """A drive whose J is a parabola of the logarithm of its scale."""
+
+    def __init__(self, monkeypatch, best: float, sigmas: float) -> None:
+        self.nodes = np.array([[1.0, 2.0, 0.3], [4.0, 6.0, 0.5]])
+        self._best = best
+        monkeypatch.setattr(any_angle, 'gain_of_objective', lambda *rest: Gain(sigmas, 1.0))
+
+    def objective(self, nodes: Floats) -> float:
+        scale = np.hypot(*(nodes[1] - nodes[0])[:2]) / 5.0
+        return -100.0 * (math.log(scale / self._best) / math.log(any_angle.SCALE_STEP)) ** 2
+
+    def scale(self) -> float:
+        found = any_angle._scaled(self, self.nodes, self.objective(self.nodes))  # type: ignore[arg-type]
+        return float(np.hypot(*(found[1] - found[0])[:2])) / 5.0
+
+
+@pytest.mark.parametrize(
+    ('best', 'sigmas', 'scale'),
+    [
+        (1.07, 3.0, 1.07),
+        (0.91, 3.0, 0.91),
+        (1.02, 3.0, 1.02),
+        # a change of less than half a step, one that is not proven, and one that is too large
+        (1.01, 3.0, 1.0),
+        (1.07, 2.0, 1.0),
+        (1.4, 3.0, 1.0),
+    ],
+)
+def test_scale_is_the_top_of_the_objective_if_that_is_clear(
+    monkeypatch, best: float, sigmas: float, scale: float
+) -> None:
+    assert Scaled(monkeypatch, best, sigmas).scale() == pytest.approx(scale)
+
+
 def test_scale_whose_map_would_be_too_large_is_not_taken(exact, scans, monkeypatch) -> None:
     true = odometry_of(exact).at(scans.windows.node_stamp)
     wrong, objective = np.column_stack([0.9 * true[:, :2], true[:, 2]]), Scans.objective
