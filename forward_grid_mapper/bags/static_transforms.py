@@ -98,7 +98,7 @@ class StaticTransforms:
         to_base, to_sensor = self._ancestors(_plain(base_frame)), self._ancestors(_plain(sensor_frame))
         # frames above the common ancestor do not matter
         common = next((frame for frame in to_sensor if frame in to_base), None)
-        way = [*takewhile(common.__ne__, to_sensor), *takewhile(common.__ne__, to_base)]
+        way = [frame for up in (to_sensor, to_base) for frame in takewhile(lambda frame: frame != common, up)]
         return [self.contradicted[frame] for frame in way if frame in self.contradicted]
 
     def lookup(self, base_frame: str, sensor_frame: str) -> Mount | None:
