@@ -42,8 +42,8 @@ ROUNDS = 4
 """Most rounds of matching and loop closing."""
 
 SCALE_STEP, LEAST_STEPS, MOST_STEPS = 1.03, 0.5, 5
-"""Factor from one scale to the next that is tried after a round, fewest steps by which the scale is changed, since J is
-noisy, and number of steps at which the search ends without a result."""
+"""Factor from one scale to the next that is tried after the rounds, fewest steps by which the scale is changed, since J
+is noisy, and number of steps at which the search ends without a result."""
 
 
 class MatchedDrive(NamedTuple):
@@ -110,9 +110,25 @@ def match_drive(
 def _match_repeatedly(
     odometry: Odometry, scans: Scans, start_stage: Callable[[str], Progress], start: Floats, noise: float, least: float
 ) -> MatchedDrive | None:
-    """Return the best result of repeated matching, each round from the result before; None if J is at most `least`."""
-    change, nodes = sensitivity(odometry, scans.windows), start
-    best, may_scale = None, True
+    """Return the best result of repeated matching, once more at another scale; None if J is at most `least`."""
+    change = sensitivity(odometry, scans.windows)
+    found = _rounds(scans, start_stage, start, noise, change, least)
+    if found is None:
+        return None
+    scaled = _scaled(scans, found.nodes, found.value)
+    if scaled is found.nodes:
+        return found
+    found = found._replace(nodes=scaled, value=scans.objective(scaled))
+    # otherwise matches would take back some of it
+    change[:, :, CALIBRATION.index('scale')] = 0.0
+    return _rounds(scans, start_stage, scaled, noise, change, found.value) or found
+
+
+def _rounds(
+    scans: Scans, start_stage: Callable[[str], Progress], start: Floats, noise: float, change: Floats, least: float
+) -> MatchedDrive | None:
+    """Return the best of some rounds of matching, each from the result before; None if J is at most `least`."""
+    nodes, best = start, None
     for _ in range(ROUNDS):
         solver = MatchSolver(scans.windows, scans, start_stage, relative(nodes[:-1], nodes[1:]), noise, change)
         solution, loops = solver.with_matches(solution_at(nodes, len(CALIBRATION)))
@@ -121,14 +137,6 @@ def _match_repeatedly(
         if found.value <= least:
             break
         best, least = found, found.value
-        scaled = _scaled(scans, nodes, found.value) if may_scale else nodes
-        may_scale = scaled is not nodes
-        if may_scale:
-            best = found._replace(nodes=scaled, value=scans.objective(scaled))
-            nodes, least = scaled, best.value
-            # further matches would take some of it back
-            change[:, :, 0] = 0.0
-            continue
         if found.part >= LEAST_RECOGNISED or rms_after_alignment(before, nodes) < SETTLED:
             break
     return best
