@@ -20,6 +20,7 @@ from ..files.output_folder import readable, unwritable
 from ..files.parameter_file import load_parameters
 from ..files.quality_warning import reading_warnings
 from ..recordings.drives import read_drives
+from ..recordings.journal_drive import poses_unused
 from .console import Ticker, run
 from .options import (
     BagParser,
@@ -115,6 +116,7 @@ def learn(options: argparse.Namespace) -> int:
         suspects = health_warning(sensor_health(found.maps))
     warnings = (
         *drives.source['warnings'],
+        *poses_unused(drives.source, extrinsics),
         *ignored,
         *reading_warnings(found.maps.readings, drives.source, parameters),
         *found.warnings,

@@ -31,7 +31,7 @@ from ..files.rerun_recording import check_rerun, write_rerun
 from ..files.results import write_results
 from ..recordings.drive import jumps_note
 from ..recordings.drives import Drives, read_drives
-from ..recordings.journal_drive import POSES_UNUSED
+from ..recordings.journal_drive import poses_unused
 from ..recordings.refined import Given, refine_drives
 from .console import Ticker, run
 from .desktop import show
@@ -151,8 +151,8 @@ def process(options: argparse.Namespace) -> int:
         )
         source = drives.source
         source['warnings'] += ignored
-        if options.refine_poses or given:
-            source['warnings'] = [text for text in source['warnings'] if not text.endswith(POSES_UNUSED)]
+        if not (options.refine_poses or given):
+            source['warnings'] += poses_unused(source, extrinsics)
         ticker.warn(source['warnings'])
         read = time.perf_counter() - begin
         refined = None

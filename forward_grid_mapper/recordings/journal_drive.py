@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -26,11 +27,18 @@ MOST_NAMED = 10
 MOST_FILES = 3
 """Most earlier files that an error names, the latest ones."""
 
-POSES_UNUSED = (
-    'a journal contains readings in the map frame: given poses of sensors have no effect, except with --refine-poses '
-    'and --odometry-calibration, where they are used to compute odometry from the readings'
-)
-"""The warning of poses of sensors, which does not hold with these options."""
+MOUNTS_FROM = 'the journal'
+"""Where the poses of the sensors come from, in the data of a drive."""
+
+
+def poses_unused(source: Mapping[str, Any], extrinsics: Mapping[str, Pose2]) -> list[str]:
+    """Return a warning if poses of sensors are given for a journal; with a refined trajectory, they are used."""
+    if not extrinsics or MOUNTS_FROM not in source['mounts_from']:
+        return []
+    return [
+        'a journal contains readings in the map frame: given poses of sensors have no effect, except with '
+        '--refine-poses and --odometry-calibration, where they are used to compute odometry from the readings'
+    ]
 
 
 def read_journal(
@@ -81,14 +89,12 @@ def read_journal(
     for point in contents.path:
         associator.extend_path(point)
     warnings = _warnings(path, contents, associator, parameters)
-    if extrinsics:
-        warnings.append(POSES_UNUSED)
     source = {
         'bag': readable(path),
         'odom_frame': associator.map_frame,
         'map_frame': associator.map_frame,
         'base_frame': associator.base_frame,
-        'mounts_from': 'the journal',
+        'mounts_from': MOUNTS_FROM,
         'stamps': [int(first), int(last)],
         'duration_s': (last - first) / NANOSECONDS,
         'path_m': length_of(associator),

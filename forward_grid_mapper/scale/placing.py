@@ -18,6 +18,7 @@ from ..files.quality_warning import reading_warnings
 from ..recordings.contradictions import echoes_of, limits_of
 from ..recordings.drive import jumps_note
 from ..recordings.drives import digest_of
+from ..recordings.journal_drive import poses_unused
 from ..recordings.read_drive import read_drive
 from .job import Job, Recordings, task
 from .tables import columns_of, write_table
@@ -49,6 +50,7 @@ def place(job: Job, number: int, recordings: Recordings) -> dict[str, Any]:
     except (BagError, InputError) as error:
         return {'error': str(error), 'kind': type(error).__name__}
     source, points = drive.source, drive.path_xy
+    source['warnings'] += poses_unused(source, recordings.extrinsics)
     source['warnings'] += [*reading_warnings(readings, source, p), *jumps_note(drive.associator)]
     del drive
     boxes = boxes_of(readings, p)

@@ -16,6 +16,7 @@ sys.path.insert(0, str(Path(__file__).parents[1] / 'files'))
 
 from journal_samples import Previous
 
+from forward_grid_mapper.commands.learn import main as learn
 from forward_grid_mapper.commands.process_bag import main as process_bag
 from forward_grid_mapper.core.common.readings import Readings
 from forward_grid_mapper.files.journal import Journal
@@ -62,6 +63,8 @@ def test_options_without_effect_on_a_journal_are_reported(tmp_path: Path, capsys
     assert process_bag([str(folder), '-o', str(tmp_path / 'a'), '--odom-topic', 'odom']) == 1
     assert 'leave out' in capsys.readouterr().err
     assert process_bag([str(folder), '-o', str(tmp_path / 'b'), '-q', '--sensor', 'sonar=0,0,0']) == 0
+    assert 'have no effect' in capsys.readouterr().err
+    assert learn([str(folder), '-q', '--sensor', 'sonar=0,0,0']) == 0
     assert 'have no effect' in capsys.readouterr().err
     refining = ['--refine-poses', '--sensor', 'sonar=0,0,0']
     assert process_bag([str(folder), '-o', str(tmp_path / 'c'), '-q', *refining]) == 0
