@@ -1,6 +1,7 @@
 """Places like the worlds of well-known robot simulators, most of them without walls at right angles, for trajectories.
 
-Nothing was tuned on them. Each function returns a world and the corners of a path through it, in metres.
+The step for the scale was developed on the cave and the arena with seeds 0 and 1. Each function returns a world and the
+corners of a path through it, in metres.
 """
 
 from __future__ import annotations
