@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-import itertools
 import math
 from dataclasses import replace
 
 import numpy as np
 import pytest
+from pentagon_drive import bent_by, exact_drive, quietly, scans_of
 
-from forward_grid_mapper.core.common.errors import Cancelled, InputError
+from forward_grid_mapper.core.common.errors import Cancelled
 from forward_grid_mapper.core.common.parameters import Parameters
 from forward_grid_mapper.core.mapping import Mapper
 from forward_grid_mapper.core.trajectory import any_angle, refinement, scan_matching
@@ -18,75 +18,27 @@ from forward_grid_mapper.core.trajectory.holding_out import Gain, held_out
 from forward_grid_mapper.core.trajectory.judging import gain_of_objective, gain_over_drive, turns_supported
 from forward_grid_mapper.core.trajectory.likelihood import scores
 from forward_grid_mapper.core.trajectory.local_map import for_matching
-from forward_grid_mapper.core.trajectory.odometry_model import CALIBRATION
 from forward_grid_mapper.core.trajectory.outcome import Refinement
-from forward_grid_mapper.core.trajectory.pose_graph import Solution, solution_at
 from forward_grid_mapper.core.trajectory.poses import Floats, compose, relative, rms_after_alignment
 from forward_grid_mapper.core.trajectory.refinement import Refiner, _Attempt, _Drive
 from forward_grid_mapper.core.trajectory.relocating import LEAST_RECOGNISED
 from forward_grid_mapper.core.trajectory.scan_matching import BLOCK, FIRST, TRUSTS, scan_matched
 from forward_grid_mapper.core.trajectory.scans import Scans
 from forward_grid_mapper.core.trajectory.windows import Odometry, cut
-from forward_grid_mapper.simulation.drift import LEVELS, odometry_of, with_drift
-from forward_grid_mapper.simulation.drive import Recording, drive
-from forward_grid_mapper.simulation.sonar import NOISY, sonar_ring
-from forward_grid_mapper.simulation.world import Floorplan, World
+from forward_grid_mapper.simulation.drift import odometry_of
+from forward_grid_mapper.simulation.drive import Recording
 
 TRUST = TRUSTS[0]
-
-MIDDLE, RADIUS, HALF = np.array([10.0, 10.0]), 7.0, 0.9
-"""Metres: a corridor along the five sides of a pentagon; its walls have five directions modulo a right angle."""
-
-
-def corners(radius: float) -> Floats:
-    angle = np.radians(np.arange(0.0, 360.0, 72.0) + 10.0)
-    return MIDDLE + radius * np.stack([np.cos(angle), np.sin(angle)], axis=1)
-
-
-def pentagon() -> World:
-    """Walls of the corridor, with a cupboard on each side."""
-    plan = Floorplan('pentagon', 200, 200)
-
-    def closed(places: Floats) -> None:
-        cells = [tuple(np.floor(place * 10).astype(int).tolist()) for place in (*places, places[0])]
-        for start, end in itertools.pairwise(cells):
-            plan.line(start, end)
-
-    inner, outer = (corners(RADIUS + side * HALF / math.cos(math.radians(36.0))) for side in (-1, 1))
-    closed(inner)
-    closed(outer)
-    for k in range(5):
-        a, b = outer[k], outer[(k + 1) % 5]
-        along = (b - a) / math.dist(a, b)
-        inside = np.array([-along[1], along[0]])
-        foot = a + (2.0 + 0.8 * k) * along
-        closed(np.array([foot, foot + 0.6 * along, foot + 0.6 * along + 0.3 * inside, foot + 0.3 * inside]))
-    return plan.world((170, 110))
 
 
 @pytest.fixture(scope='module')
 def exact() -> Recording:
-    path = corners(RADIUS)
-    return drive(pentagon(), np.concatenate([path, path[:4]]), 0.12, sonar_ring(12), NOISY, seed=3)
-
-
-def bent_by(exact: Recording, level: str, seed: int) -> tuple[Recording, Odometry]:
-    recording = with_drift(exact, LEVELS[level], seed)
-    return recording, odometry_of(recording)
-
-
-def scans_of(recording: Recording, odometry: Odometry) -> Scans:
-    windows = cut(recording.readings, odometry)
-    return Scans(windows, for_matching(Parameters()), np.zeros(1, np.uint8), held_out(len(windows)))
-
-
-def quietly(part: float) -> None:
-    """Ignore the progress."""
+    return exact_drive()
 
 
 @pytest.fixture(scope='module')
-def bent(exact: Recording) -> tuple[Recording, Odometry]:
-    return bent_by(exact, 'high', 5)
+def bent() -> tuple[Recording, Odometry]:
+    return bent_by(exact_drive(), 'high', 5)
 
 
 @pytest.fixture(scope='module')
@@ -239,82 +191,6 @@ def test_drive_above_max_cells_keeps_the_trajectory_from_walls(bent, scans) -> N
     assert Refiner(Parameters())._at_any_angle(drive_of._replace(scans=small), attempt, 0.15) is attempt.refinement
 
 
-class Trials:
-    """A solver that moves the second half of a drive by a metre in each round, and records its arguments.
-
-    Parameters
-    ----------
-    values : list of float, float
-    The share of recognised places of each round, and its J.
-    far : float
-    Metres by which a round moves the nodes.
-    """
-
-    def __init__(self, monkeypatch, values: list[tuple[float, float]], far: float = 1.0) -> None:
-        self.calls: list[tuple[Floats, float]] = []
-        self._far = far
-        monkeypatch.setattr(any_angle, 'MatchSolver', self._solver)
-        monkeypatch.setattr(any_angle, 'scan_matched', lambda scans, trust, watch: scans.windows.node)
-        monkeypatch.setattr(Scans, 'objective', lambda *rest: values[len(self.calls) - 1][1] if self.calls else 0.0)
-        monkeypatch.setattr(any_angle, 'recognised_part', lambda *rest: values[len(self.calls) - 1][0])
-
-    def _solver(self, windows, scans, say, motion: Floats, noise: float, change) -> Trials:
-        self.calls.append((motion, noise))
-        self.change = change
-        return self
-
-    def with_matches(self, solution: Solution) -> tuple[Solution, list]:
-        nodes = solution.nodes.copy()
-        np.testing.assert_array_equal(self.calls[-1][0], relative(nodes[:-1], nodes[1:]))
-        nodes[len(nodes) // 2 :, 0] += self._far
-        return solution_at(nodes, 4), []
-
-
-@pytest.mark.parametrize(
-    ('values', 'rounds'),
-    [
-        ([(0.9, 1.0)], 1),
-        ([(0.5, 1.0), (0.9, 2.0)], 2),
-        # if J does not grow in a round, another trust is tried
-        ([(0.5, 1.0), (0.5, 0.5), (0.9, 3.0)], 1),
-        ([(0.5, 1.0), (0.5, 2.0), (0.9, 1.5), (0.9, 1.0)], 2),
-        ([(0.5, 1.0), (0.5, 1.0), (0.9, 0.5)], 1),
-        ([(0.5, 1.0 + k) for k in range(2 * any_angle.ROUNDS)], any_angle.ROUNDS),
-    ],
-)
-def test_rounds_continue_while_few_places_are_recognised_and_j_grows(
-    bent, scans, monkeypatch, values: list[tuple[float, float]], rounds: int
-) -> None:
-    trials = Trials(monkeypatch, values)
-    found = any_angle.match_drive(bent[1], scans, lambda stage: quietly)
-    assert found is not None
-    assert len(trials.calls) == len(values)
-    assert found.value == max(value for _, value in values)
-    assert found.nodes[-1, 0] - scans.windows.node[-1, 0] == pytest.approx(rounds)
-
-
-def test_without_gain_over_odometry_no_more_rounds_are_tried(bent, scans, monkeypatch) -> None:
-    trials = Trials(monkeypatch, [(0.5, -1.0)])
-    assert any_angle.match_drive(bent[1], scans, lambda stage: quietly) is None
-    assert len(trials.calls) == 1
-
-
-def test_round_that_moves_nothing_is_the_last(bent, scans, monkeypatch) -> None:
-    trials = Trials(monkeypatch, [(0.5, 1.0), (0.5, 2.0)], far=0.01)
-    assert any_angle.match_drive(bent[1], scans, lambda stage: quietly) is not None
-    assert len(trials.calls) == len(TRUSTS)
-
-
-def test_given_noise_of_odometry_is_used(bent, scans, monkeypatch) -> None:
-    trusts: list[scan_matching.Trust] = []
-    trials = Trials(monkeypatch, [(0.5, 1.0 + k) for k in range(4)], far=0.0)
-    monkeypatch.setattr(any_angle, 'scan_matched', lambda scans, trust, _: trusts.append(trust) or scans.windows.node)
-    for noise in (0.0, 0.01):
-        any_angle.match_drive(bent[1], scans, lambda stage: quietly, noise)
-    assert trusts == [*TRUSTS, *(trust._replace(yaw=0.01) for trust in TRUSTS)]
-    assert [noise for _, noise in trials.calls] == [any_angle.REMAINING_YAW_NOISE] * 2 + [0.01] * 2
-
-
 def test_objective_of_the_true_poses_is_larger_than_of_odometry(exact, bent, scans) -> None:
     windows, true = scans.windows, odometry_of(exact).at(scans.windows.node_stamp)
     right = scans.objective(true)
@@ -372,16 +248,6 @@ def test_matches_alone_replace_walls_only_with_a_much_larger_j(
     assert (found is attempt.refinement) == (sigmas < 2.3)
     ((before, after),) = told
     assert before is attempt.nodes and after is matched
-
-
-def test_rounds_end_early_below_the_j_of_a_known_trajectory(bent, scans, monkeypatch) -> None:
-    trials, objective = Trials(monkeypatch, [(0.5, 1.0), (0.5, 2.0)]), Scans.objective
-    known = scans.windows.node + 1.0
-    monkeypatch.setattr(Scans, 'objective', lambda s, nodes: 3.0 if nodes is known else objective(s, nodes))
-    for sigmas, rounds in ((1.0, 0), (2.0, 1)):
-        monkeypatch.setattr(any_angle, 'gain_over_drive', lambda *rest, by=sigmas: Gain(by, 1.0))
-        assert any_angle.match_drive(bent[1], scans, lambda stage: quietly, 0.0, known) is None
-        assert len(trials.calls) == rounds
 
 
 def test_scan_matching_predicts_better_than_corners_taken_for_square(exact, scans) -> None:
@@ -447,81 +313,3 @@ def test_scan_matching_can_be_cancelled(bent, monkeypatch) -> None:
     with pytest.raises(Cancelled):
         refiner.run(recording.readings, odometry, watch)
     assert stages[-1] == 'scan matching'
-
-
-@pytest.mark.parametrize('factor', [0.9, 1.1])
-def test_wrong_scale_of_a_drive_is_found_by_its_objective(exact, scans, factor: float) -> None:
-    true = odometry_of(exact).at(scans.windows.node_stamp)
-    wrong = np.column_stack([factor * true[:, :2], true[:, 2]])
-    found = any_angle._scaled(scans, wrong, scans.objective(wrong))
-    scale = np.hypot(*(found[-1, :2] - found[0, :2])) / np.hypot(*(true[-1, :2] - true[0, :2]))
-    assert scale == pytest.approx(1.0, abs=0.02)
-    assert np.array_equal(found[0], wrong[0])
-    assert np.array_equal(found[:, 2], wrong[:, 2])
-
-
-def test_right_scale_of_a_drive_is_kept(exact, scans) -> None:
-    true = odometry_of(exact).at(scans.windows.node_stamp)
-    assert any_angle._scaled(scans, true, scans.objective(true)) is true
-
-
-class Scaled:
-    """A drive whose J is a parabola of the logarithm of its scale."""
-
-    def __init__(self, monkeypatch, best: float, sigmas: float) -> None:
-        self.nodes = np.array([[1.0, 2.0, 0.3], [4.0, 6.0, 0.5]])
-        self._best = best
-        monkeypatch.setattr(any_angle, 'gain_of_objective', lambda *rest: Gain(sigmas, 1.0))
-
-    def objective(self, nodes: Floats) -> float:
-        scale = np.hypot(*(nodes[1] - nodes[0])[:2]) / 5.0
-        return -100.0 * (math.log(scale / self._best) / math.log(any_angle.SCALE_STEP)) ** 2
-
-    def scale(self) -> float:
-        found = any_angle._scaled(self, self.nodes, self.objective(self.nodes))  # type: ignore[arg-type]
-        return float(np.hypot(*(found[1] - found[0])[:2])) / 5.0
-
-
-@pytest.mark.parametrize(
-    ('best', 'sigmas', 'scale'),
-    [
-        (1.07, 3.0, 1.07),
-        (0.91, 3.0, 0.91),
-        (1.02, 3.0, 1.02),
-        # a change of less than half a step, one that is not proven, and one that is too large
-        (1.01, 3.0, 1.0),
-        (1.07, 2.0, 1.0),
-        (1.4, 3.0, 1.0),
-    ],
-)
-def test_scale_is_the_top_of_the_objective_if_that_is_clear(
-    monkeypatch, best: float, sigmas: float, scale: float
-) -> None:
-    assert Scaled(monkeypatch, best, sigmas).scale() == pytest.approx(scale)
-
-
-def test_scale_whose_map_would_be_too_large_is_not_taken(exact, scans, monkeypatch) -> None:
-    true = odometry_of(exact).at(scans.windows.node_stamp)
-    wrong, objective = np.column_stack([0.9 * true[:, :2], true[:, 2]]), Scans.objective
-    widest = np.ptp(wrong[:, 0]) * 1.05
-
-    def limited(s: Scans, nodes: Floats) -> float:
-        if np.ptp(nodes[:, 0]) > widest:
-            raise InputError('the map would be too large')
-        return objective(s, nodes)
-
-    monkeypatch.setattr(Scans, 'objective', limited)
-    found = any_angle._scaled(scans, wrong, objective(scans, wrong))
-    assert np.ptp(found[:, 0]) == pytest.approx(np.ptp(wrong[:, 0]) * any_angle.SCALE_STEP)
-
-
-def test_next_round_holds_the_scale_that_was_found(bent, scans, monkeypatch) -> None:
-    trials = Trials(monkeypatch, [(0.9, 1.0), (0.9, 2.0)], far=0.0)
-    larger = scans.windows.node * [1.05, 1.05, 1.0]
-    monkeypatch.setattr(any_angle, '_scaled', lambda _, nodes, value: larger if len(trials.calls) == 1 else nodes)
-    found = any_angle.match_drive(bent[1], scans, lambda stage: quietly)
-    assert found is not None
-    assert len(trials.calls) == 2
-    assert found.nodes == pytest.approx(larger)
-    assert not trials.change[:, :, CALIBRATION.index('scale')].any()
-    assert trials.change[:, :, CALIBRATION.index('bias')].any()

@@ -1,0 +1,200 @@
+"""Matching alone: rounds of matching and loop closing, and the scale of the trajectory."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from pentagon_drive import bent_by, exact_drive, quietly, scans_of
+
+from forward_grid_mapper.core.common.errors import InputError
+from forward_grid_mapper.core.trajectory import any_angle, scan_matching
+from forward_grid_mapper.core.trajectory.holding_out import Gain
+from forward_grid_mapper.core.trajectory.odometry_model import CALIBRATION
+from forward_grid_mapper.core.trajectory.pose_graph import Solution, solution_at
+from forward_grid_mapper.core.trajectory.poses import Floats, relative
+from forward_grid_mapper.core.trajectory.scan_matching import TRUSTS
+from forward_grid_mapper.core.trajectory.scans import Scans
+from forward_grid_mapper.core.trajectory.windows import Odometry
+from forward_grid_mapper.simulation.drift import odometry_of
+from forward_grid_mapper.simulation.drive import Recording
+
+
+@pytest.fixture(scope='module')
+def exact() -> Recording:
+    return exact_drive()
+
+
+@pytest.fixture(scope='module')
+def bent() -> tuple[Recording, Odometry]:
+    return bent_by(exact_drive(), 'high', 5)
+
+
+@pytest.fixture(scope='module')
+def scans(bent: tuple[Recording, Odometry]) -> Scans:
+    return scans_of(*bent)
+
+
+class Trials:
+    """A solver that moves the second half of a drive by a metre in each round, and records its arguments.
+
+    Parameters
+    ----------
+    values : list of float, float
+        The share of recognised places of each round, and its J.
+    far : float
+        Metres by which a round moves the nodes.
+    """
+
+    def __init__(self, monkeypatch, values: list[tuple[float, float]], far: float = 1.0) -> None:
+        self.calls: list[tuple[Floats, float]] = []
+        self._far = far
+        monkeypatch.setattr(any_angle, 'MatchSolver', self._solver)
+        monkeypatch.setattr(any_angle, 'scan_matched', lambda scans, trust, watch: scans.windows.node)
+        monkeypatch.setattr(Scans, 'objective', lambda *rest: values[len(self.calls) - 1][1] if self.calls else 0.0)
+        monkeypatch.setattr(any_angle, 'recognised_part', lambda *rest: values[len(self.calls) - 1][0])
+
+    def _solver(self, windows, scans, say, motion: Floats, noise: float, change) -> Trials:
+        self.calls.append((motion, noise))
+        self.change = change
+        return self
+
+    def with_matches(self, solution: Solution) -> tuple[Solution, list]:
+        nodes = solution.nodes.copy()
+        np.testing.assert_array_equal(self.calls[-1][0], relative(nodes[:-1], nodes[1:]))
+        nodes[len(nodes) // 2 :, 0] += self._far
+        return solution_at(nodes, 4), []
+
+
+@pytest.mark.parametrize(
+    ('values', 'rounds'),
+    [
+        ([(0.9, 1.0)], 1),
+        ([(0.5, 1.0), (0.9, 2.0)], 2),
+        # if J does not grow in a round, another trust is tried
+        ([(0.5, 1.0), (0.5, 0.5), (0.9, 3.0)], 1),
+        ([(0.5, 1.0), (0.5, 2.0), (0.9, 1.5), (0.9, 1.0)], 2),
+        ([(0.5, 1.0), (0.5, 1.0), (0.9, 0.5)], 1),
+        ([(0.5, 1.0 + k) for k in range(2 * any_angle.ROUNDS)], any_angle.ROUNDS),
+    ],
+)
+def test_rounds_continue_while_few_places_are_recognised_and_j_grows(
+    bent, scans, monkeypatch, values: list[tuple[float, float]], rounds: int
+) -> None:
+    trials = Trials(monkeypatch, values)
+    found = any_angle.match_drive(bent[1], scans, lambda stage: quietly)
+    assert found is not None
+    assert len(trials.calls) == len(values)
+    assert found.value == max(value for _, value in values)
+    assert found.nodes[-1, 0] - scans.windows.node[-1, 0] == pytest.approx(rounds)
+
+
+def test_without_gain_over_odometry_no_more_rounds_are_tried(bent, scans, monkeypatch) -> None:
+    trials = Trials(monkeypatch, [(0.5, -1.0)])
+    assert any_angle.match_drive(bent[1], scans, lambda stage: quietly) is None
+    assert len(trials.calls) == 1
+
+
+def test_round_that_moves_nothing_is_the_last(bent, scans, monkeypatch) -> None:
+    trials = Trials(monkeypatch, [(0.5, 1.0), (0.5, 2.0)], far=0.01)
+    assert any_angle.match_drive(bent[1], scans, lambda stage: quietly) is not None
+    assert len(trials.calls) == len(TRUSTS)
+
+
+def test_given_noise_of_odometry_is_used(bent, scans, monkeypatch) -> None:
+    trusts: list[scan_matching.Trust] = []
+    trials = Trials(monkeypatch, [(0.5, 1.0 + k) for k in range(4)], far=0.0)
+    monkeypatch.setattr(any_angle, 'scan_matched', lambda scans, trust, _: trusts.append(trust) or scans.windows.node)
+    for noise in (0.0, 0.01):
+        any_angle.match_drive(bent[1], scans, lambda stage: quietly, noise)
+    assert trusts == [*TRUSTS, *(trust._replace(yaw=0.01) for trust in TRUSTS)]
+    assert [noise for _, noise in trials.calls] == [any_angle.REMAINING_YAW_NOISE] * 2 + [0.01] * 2
+
+
+def test_rounds_end_early_below_the_j_of_a_known_trajectory(bent, scans, monkeypatch) -> None:
+    trials, objective = Trials(monkeypatch, [(0.5, 1.0), (0.5, 2.0)]), Scans.objective
+    known = scans.windows.node + 1.0
+    monkeypatch.setattr(Scans, 'objective', lambda s, nodes: 3.0 if nodes is known else objective(s, nodes))
+    for sigmas, rounds in ((1.0, 0), (2.0, 1)):
+        monkeypatch.setattr(any_angle, 'gain_over_drive', lambda *rest, by=sigmas: Gain(by, 1.0))
+        assert any_angle.match_drive(bent[1], scans, lambda stage: quietly, 0.0, known) is None
+        assert len(trials.calls) == rounds
+
+
+@pytest.mark.parametrize('factor', [0.9, 1.1])
+def test_wrong_scale_of_a_drive_is_found_by_its_objective(exact, scans, factor: float) -> None:
+    true = odometry_of(exact).at(scans.windows.node_stamp)
+    wrong = np.column_stack([factor * true[:, :2], true[:, 2]])
+    found = any_angle._scaled(scans, wrong, scans.objective(wrong))
+    scale = np.hypot(*(found[-1, :2] - found[0, :2])) / np.hypot(*(true[-1, :2] - true[0, :2]))
+    assert scale == pytest.approx(1.0, abs=0.02)
+    assert np.array_equal(found[0], wrong[0])
+    assert np.array_equal(found[:, 2], wrong[:, 2])
+
+
+def test_right_scale_of_a_drive_is_kept(exact, scans) -> None:
+    true = odometry_of(exact).at(scans.windows.node_stamp)
+    assert any_angle._scaled(scans, true, scans.objective(true)) is true
+
+
+class Scaled:
+    """A drive whose J is a parabola of the logarithm of its scale."""
+
+    def __init__(self, monkeypatch, best: float, sigmas: float) -> None:
+        self.nodes = np.array([[1.0, 2.0, 0.3], [4.0, 6.0, 0.5]])
+        self._best = best
+        monkeypatch.setattr(any_angle, 'gain_of_objective', lambda *rest: Gain(sigmas, 1.0))
+
+    def objective(self, nodes: Floats) -> float:
+        scale = np.hypot(*(nodes[1] - nodes[0])[:2]) / 5.0
+        return -100.0 * (math.log(scale / self._best) / math.log(any_angle.SCALE_STEP)) ** 2
+
+    def scale(self) -> float:
+        found = any_angle._scaled(self, self.nodes, self.objective(self.nodes))  # type: ignore[arg-type]
+        return float(np.hypot(*(found[1] - found[0])[:2])) / 5.0
+
+
+@pytest.mark.parametrize(
+    ('best', 'sigmas', 'scale'),
+    [
+        (1.07, 3.0, 1.07),
+        (0.91, 3.0, 0.91),
+        (1.02, 3.0, 1.02),
+        # a change of less than half a step, one that is not proven, and one that is too large
+        (1.01, 3.0, 1.0),
+        (1.07, 2.0, 1.0),
+        (1.4, 3.0, 1.0),
+    ],
+)
+def test_scale_is_the_top_of_the_objective_if_that_is_clear(
+    monkeypatch, best: float, sigmas: float, scale: float
+) -> None:
+    assert Scaled(monkeypatch, best, sigmas).scale() == pytest.approx(scale)
+
+
+def test_scale_whose_map_would_be_too_large_is_not_taken(exact, scans, monkeypatch) -> None:
+    true = odometry_of(exact).at(scans.windows.node_stamp)
+    wrong, objective = np.column_stack([0.9 * true[:, :2], true[:, 2]]), Scans.objective
+    widest = np.ptp(wrong[:, 0]) * 1.05
+
+    def limited(s: Scans, nodes: Floats) -> float:
+        if np.ptp(nodes[:, 0]) > widest:
+            raise InputError('the map would be too large')
+        return objective(s, nodes)
+
+    monkeypatch.setattr(Scans, 'objective', limited)
+    found = any_angle._scaled(scans, wrong, objective(scans, wrong))
+    assert np.ptp(found[:, 0]) == pytest.approx(np.ptp(wrong[:, 0]) * any_angle.SCALE_STEP)
+
+
+def test_next_round_holds_the_scale_that_was_found(bent, scans, monkeypatch) -> None:
+    trials = Trials(monkeypatch, [(0.9, 1.0), (0.9, 2.0)], far=0.0)
+    larger = scans.windows.node * [1.05, 1.05, 1.0]
+    monkeypatch.setattr(any_angle, '_scaled', lambda _, nodes, value: larger if len(trials.calls) == 1 else nodes)
+    found = any_angle.match_drive(bent[1], scans, lambda stage: quietly)
+    assert found is not None
+    assert len(trials.calls) == 2
+    assert found.nodes == pytest.approx(larger)
+    assert not trials.change[:, :, CALIBRATION.index('scale')].any()
+    assert trials.change[:, :, CALIBRATION.index('bias')].any()
