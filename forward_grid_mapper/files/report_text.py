@@ -11,8 +11,8 @@ from typing import Any
 from ..core.common.words import counted
 
 UNTESTED = (
-    'the drive may not determine these values, which are estimated with the trajectory: process_bag --refine-poses '
-    'states those that it does, with their standard deviations'
+    'the drive may not determine these values; process_bag --refine-poses reports those that it determines, with their '
+    'standard deviations'
 )
 """Said of a calibration that was not tested: along a bare corridor, its values may have the wrong sign."""
 
