@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ..runtime.jit import kernel
+from ..runtime.jit import inlined_kernel
 
 QUANTUM = 2.0**-24
 """Nats in a unit; a ratio fits in 32 bits with ±128 nats."""
@@ -36,7 +36,7 @@ def ratio_workspace_for(largest: int) -> RatioWorkspace:
     return RatioWorkspace(ratio, ratio.view(np.int32), mantissa, mantissa.view(np.int32))
 
 
-@kernel
+@inlined_kernel
 def quantise_logs(ratios: RatioWorkspace, m: int, out: Any) -> None:
     """Write the logs of the first m ratios (positive, normal) into `out` (int32), in units of QUANTUM.
 

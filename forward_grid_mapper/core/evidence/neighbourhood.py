@@ -9,7 +9,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from ..runtime.jit import kernel
+from ..runtime.jit import inlined_kernel, kernel
 
 NEIGHBOURS = 8
 
@@ -22,13 +22,13 @@ DY = (0, 1, 1, 1, 0, -1, -1, -1)
 """Rows from a cell to each neighbour."""
 
 
-@kernel
+@inlined_kernel
 def offset(k: int, width: int) -> int:
     """Return the difference between the indices of neighbour k and the cell."""
     return DY[k] * width + DX[k]
 
 
-@kernel
+@inlined_kernel
 def neighbour(c: int, k: int, height: int, width: int) -> int:
     """Return neighbour k of cell c; -1 outside of the grid."""
     x, y = c % width + DX[k], c // width + DY[k]
@@ -41,7 +41,7 @@ def opposite(k: int) -> int:
     return (k + 4) & 7
 
 
-@kernel
+@inlined_kernel
 def note_flip(pattern: NDArray[np.uint8], c: int, height: int, width: int) -> None:
     """Update the patterns of the neighbours of cell c after its flip."""
     for k in range(NEIGHBOURS):

@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ..runtime.jit import kernel
+from ..runtime.jit import inlined_kernel
 
 SHIFT = 3
 """A tile is 2³ cells wide and high."""
@@ -57,7 +57,7 @@ def more_chunks(tiles: Tiles) -> Tiles:
     return tiles._replace(chunks=chunks)
 
 
-@kernel
+@inlined_kernel
 def insert(tiles: Tiles, row: int, first: int, last: int, t: Any) -> None:
     """Insert reading t for the cells `first` to `last` of a row; there must be a free chunk for each tile."""
     line = (row >> SHIFT) * tiles.across

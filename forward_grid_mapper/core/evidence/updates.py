@@ -22,7 +22,7 @@ from typing import Any
 
 import numpy as np
 
-from ..runtime.jit import kernel
+from ..runtime.jit import inlined_kernel, kernel
 from ..sensor.cone import rows_of, runs_of
 from ..sensor.cone_table import cone_of
 from ..sensor.surface_normals import exceeds_incidence_angle
@@ -40,12 +40,14 @@ LEAST_RATIO = 1e-30
 """Smallest likelihood ratio, because of rounding."""
 
 
-@kernel
-def evaluate(model: Model, reading_state: Any, occupied: Any, pairs: Pairs, at: int, workspace: Workspace) -> None:
-    """Write the log ratios of a reading on the map (E-step) to `workspace.new`, in the order of its band.
+@inlined_kernel
+def compute_ratios(
+    model: Model, reading_state: Any, occupied: Any, pairs: Pairs, at: int, workspace: Workspace
+) -> None:
+    """Write the likelihood ratios of a reading on the map (E-step) to `workspace.ratios`, in the order of its band.
 
-    They are followed by those of occupying and of freeing a cell of the free zone, and the log-likelihood of the
-    reading.
+    They are followed by those of occupying and of freeing a cell of the free zone, and the likelihood of the reading.
+    Uses `workspace.new`.
 
     Parameters
     ----------
@@ -88,7 +90,13 @@ def evaluate(model: Model, reading_state: Any, occupied: Any, pairs: Pairs, at: 
     ratio[m] = (floor + total * q) * scale
     ratio[m + one] = (floor + total / q) * scale
     ratio[m + one + one] = floor + total
-    quantise_logs(workspace.ratios, reading_state.bands + 3, out)
+
+
+@inlined_kernel
+def evaluate(model: Model, reading_state: Any, occupied: Any, pairs: Pairs, at: int, workspace: Workspace) -> None:
+    """Write the logs of the results of `compute_ratios` to `workspace.new`; the parameters are the same."""
+    compute_ratios(model, reading_state, occupied, pairs, at, workspace)
+    quantise_logs(workspace.ratios, reading_state.bands + 3, workspace.new)
 
 
 @kernel
@@ -99,7 +107,7 @@ def _make_pairs(s: State, t: int) -> None:
     reading_state.runs, reading_state.bands = make(s.cones, s.lattice, s.normals, t, pairs, at, s.workspace)
 
 
-@kernel
+@inlined_kernel
 def pairs_of(s: State, t: int) -> tuple[Pairs, int]:
     """Return the pairs of reading t and their index; if they are not stored, they are made, without logs."""
     reading_state = s.reading_states[t]
@@ -108,7 +116,7 @@ def pairs_of(s: State, t: int) -> tuple[Pairs, int]:
     return (s.pairs, reading_state.at) if reading_state.stored else (s.workspace.pairs, 0)
 
 
-@kernel
+@inlined_kernel
 def pairs_with_logs(s: State, t: int) -> tuple[Pairs, int]:
     """Do the same as `pairs_of`, with the logs for the present map."""
     pairs, at = pairs_of(s, t)
@@ -121,7 +129,7 @@ def pairs_with_logs(s: State, t: int) -> tuple[Pairs, int]:
     return pairs, at
 
 
-@kernel
+@inlined_kernel
 def _add_to_free_zone(reading_state: Any, pairs: Pairs, at: int, maps: Maps, steps: tuple[int, int]) -> None:
     """Add steps[0] to the evidence of the free cells of the free zone, steps[1] to that of the occupied."""
     for k in range(np.uint64(at), np.uint64(at + WORDS_PER_RUN * reading_state.runs), np.uint64(WORDS_PER_RUN)):
@@ -129,7 +137,7 @@ def _add_to_free_zone(reading_state: Any, pairs: Pairs, at: int, maps: Maps, ste
             maps.evidence[c] += steps[1] if maps.occupied[c] else steps[0]
 
 
-@kernel
+@inlined_kernel
 def _add_difference(reading_state: Any, pairs: Pairs, at: int, maps: Maps, new: Any) -> None:
     """Replace the logs of a reading by those of `evaluate`, and add the differences to the evidence."""
     m, multiplicity = reading_state.bands, reading_state.multiplicity
@@ -143,7 +151,7 @@ def _add_difference(reading_state: Any, pairs: Pairs, at: int, maps: Maps, new: 
     reading_state.occupy, reading_state.release, reading_state.likelihood = new[m], new[m + 1], new[m + 2]
 
 
-@kernel
+@inlined_kernel
 def evaluate_and_add(s: State, t: int, pairs: Pairs, at: int) -> None:
     """Evaluate reading t on the map, and add its terms to the evidence; its pairs begin at `at`."""
     maps = s.maps
@@ -191,7 +199,7 @@ def evaluate_all(s: State, begin: int, end: int, new: bool) -> None:
         evaluate_and_add(s, t, pairs, at)
 
 
-@kernel
+@inlined_kernel
 def _observes_flipped(reading_state: Any, pairs: Pairs, at: int, flipped: Any) -> bool:
     """Return whether any cell of a reading is set in `flipped`."""
     begin = np.uint64(at + WORDS_PER_RUN * reading_state.runs)
@@ -275,7 +283,7 @@ def add_multiplicity(s: State, readings: Any) -> None:
         _add_seen(s, t, 1)
 
 
-@kernel
+@inlined_kernel
 def _zone(reading: Any, lattice: Lattice, row: int, column: int) -> int:
     """Return 2 if a cell is in the free zone of a cone, 1 if in its band, 0 if in neither."""
     du, dv = column + 0.5 - reading.x, row + 0.5 - reading.y

@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from ..common.readings import Floats
 from ..evidence.evidence import Evidence
 from ..evidence.state import State
-from ..runtime.jit import allocating_kernel, kernel
+from ..runtime.jit import allocating_kernel, inlined_kernel
 from ..sensor.cone import rows_of, runs_of, strength
 from ..sensor.cone_table import cone_of
 from ..sensor.density import density
@@ -38,7 +38,7 @@ UNIT = 2.0**-20
 """Unit of the integer sums of passes, in readings; integer sums do not depend on their order."""
 
 
-@kernel
+@inlined_kernel
 def direction_of(u: float, v: float) -> int:
     """Return which of the directions the vector (u, v) has; symmetric under the symmetries of the lattice."""
     if abs(v) < EIGHTH * abs(u):
@@ -66,7 +66,7 @@ def noticed_by(max_incidence_angle: float) -> Floats:
     return out
 
 
-@kernel
+@inlined_kernel
 def _obstacles(s: State, t: int, occupied: Any, squares: Any, remaining: Any) -> tuple[int, int, float]:
     """List the occupied cells in the band of a cone, including those beyond the limit of the incidence angle.
 

@@ -25,7 +25,7 @@ from ..common.constants import IMAGE_AROUND, LEAST_IN_SIGHT, LEAST_STRENGTH, SAM
 from ..evidence.evidence import Evidence
 from ..evidence.state import State
 from ..runtime.cancelling import check
-from ..runtime.jit import kernel
+from ..runtime.jit import inlined_kernel, kernel
 from ..sensor.cone import rows_of, runs_of, strength
 from ..sensor.cone_table import cone_of
 
@@ -36,7 +36,7 @@ STEP = 0.5
 """Cells between the points of a line of sight at which the map is tested."""
 
 
-@kernel
+@inlined_kernel
 def in_line_of_sight(reading: Any, u: float, v: float, until: float, occupied: Any, lattice: Any) -> bool:
     """Return whether the first `until` cells from the apex of a reading towards (u, v) are without occupied cells."""
     distance = math.sqrt(u * u + v * v)

@@ -94,6 +94,11 @@ def kernel(function: F) -> F:
     return _compiled(function, _nrt=False)
 
 
+def inlined_kernel(function: F) -> F:
+    """Do the same as `kernel`, for a function that the compiler inserts into its callers."""
+    return _compiled(function, _nrt=False, forceinline=True)
+
+
 def allocating_kernel(function: F) -> F:
     """Do the same as `kernel`, for a function that allocates arrays."""
     return _compiled(function)

@@ -11,11 +11,11 @@ from ..common.readings import Floats
 from ..evidence.neighbourhood import NEIGHBOURS, neighbour
 from ..evidence.state import State
 from ..evidence.updates import flip
-from ..runtime.jit import allocating_kernel, kernel
+from ..runtime.jit import allocating_kernel, inlined_kernel, kernel
 from .prior import Prior, prior_gain
 
 
-@kernel
+@inlined_kernel
 def gain_of(s: State, prior: Prior, c: int) -> float:
     """Return the gain of flipping cell c, including the prior, nats."""
     data = s.maps.evidence[c] * s.model.nats
@@ -30,7 +30,7 @@ Least = tuple[float, float]
 """Nats that a flip must gain, and nats that it must gain in addition for each reading that observes the cell."""
 
 
-@kernel
+@inlined_kernel
 def least_gain(s: State, least: Least, c: int) -> float:
     """Return the least gain of a flip of cell c, nats."""
     return float(least[0] + least[1] * s.maps.seen[c])
@@ -40,7 +40,7 @@ BLOCK = 64
 """Cells of a row that are tested together."""
 
 
-@kernel
+@inlined_kernel
 def any_above(evidence: Any, occupied: Any, pattern: Any, floor: Any, begin: int, end: int) -> bool:
     """Return whether any of some cells has evidence above `floor`, or is occupied, or has an occupied neighbour."""
     found = 0

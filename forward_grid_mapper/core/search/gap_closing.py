@@ -183,10 +183,12 @@ def _close(s: State, prior: Prior, least: Least, gaps: Any, paths: Any, starts: 
     gains : float64, shape (gaps,)
         Output, as in `_flip_sets`.
     """
+    # not a literal, of which numba makes a type of its own, so that callees are compiled once
+    keep: Any = np.bool_(True)
     for k in range(len(gaps)):
         gains[k] = 0.0
         if _is_gap(s, prior, gaps[k], paths[k]):
-            _flip_sets(s, prior, least, paths[k], starts, True, gains[k : k + 1])
+            _flip_sets(s, prior, least, paths[k], starts, keep, gains[k : k + 1])
 
 
 def _gain_of_sets(

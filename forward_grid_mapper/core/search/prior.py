@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from ..common.constants import FORBIDDEN
 from ..common.parameter_groups import SearchParameters
 from ..evidence.neighbourhood import NEIGHBOURS, offset, opposite, patterns
-from ..runtime.jit import allocating_kernel, kernel
+from ..runtime.jit import allocating_kernel, inlined_kernel
 from ..sensor.cone_table import Floats
 
 OPPOSITE_ENOUGH = 3
@@ -106,7 +106,7 @@ def _local(odds: float, traversed: NDArray[np.bool_]) -> Floats:
     return out
 
 
-@kernel
+@inlined_kernel
 def prior_gain(prior: Prior, occupied: NDArray[np.uint8], pattern: NDArray[np.uint8], c: int, width: int) -> float:
     """Return the change of the log prior by flipping cell c."""
     own = pattern[c]

@@ -41,7 +41,7 @@ from ..sensor.cone_table import Floats
 from .flips import flip_in_order, free_unneeded, highest, promising
 from .gap_closing import close_gaps, remove_short_walls
 from .prior import Prior, has_walls, independent_prior, log_prior, wall_prior
-from .shifts import best_shifts, mark_observing, shift_in_order, try_shifts, unsettle
+from .shifts import best_shifts, mark_observing, ratio_batch, shift_in_order, try_shifts, unsettle
 
 LEAST_GAIN = 1e-4
 """Nats that a flip must gain."""
@@ -287,17 +287,17 @@ class Search:
             observing[:] = 0
             mark_observing(s, cells, observing)
         readings = np.flatnonzero(observing)
-        joint = np.zeros((len(cells), NEIGHBOURS), np.int64)
+        joint = np.zeros(len(cells) * NEIGHBOURS, np.int64)
 
         def work(s: State, begin: int, end: int, own: NDArray[np.int64]) -> None:
             place = self._none()
-            try_shifts(s, readings[begin:end], slot, place, own)
+            try_shifts(s, readings[begin:end], slot, place, ratio_batch(), own)
             self._all_none.append(place)
 
         evidence.summed(0, len(readings), work, joint, beside=slot.nbytes)
         slot[cells] = -1
         self._all_none.append(slot)
-        targets, gains = best_shifts(s, self._prior, LEAST, cells, joint)
+        targets, gains = best_shifts(s, self._prior, LEAST, cells, joint.reshape(-1, NEIGHBOURS))
         order = np.argsort(-gains, kind='stable')[: int((targets >= 0).sum())]
         shifts, gain = shift_in_order(s, self._prior, LEAST, cells[order], targets[order])
         self._advance(0, shifts, gain, watch)

@@ -13,24 +13,55 @@ So one pass over the readings gives the gains of all shifts, and only those with
 
 from __future__ import annotations
 
-import math
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ..evidence.fixed_point import QUANTUM
+from ..evidence.fixed_point import RatioWorkspace, quantise_logs, ratio_workspace_for
 from ..evidence.neighbourhood import NEIGHBOURS, neighbour, note_flip
 from ..evidence.pairs import WORDS_PER_RUN, Pairs
 from ..evidence.state import State
-from ..evidence.updates import find_observing, flip, pairs_of, pairs_with_logs
-from ..runtime.jit import allocating_kernel, kernel
+from ..evidence.updates import compute_ratios, find_observing, flip, pairs_of, pairs_with_logs
+from ..runtime.jit import allocating_kernel, inlined_kernel, kernel
 from ..sensor.cone_table import Floats
 from .flips import Least, gain_of, least_gain
 from .prior import Prior
 
 LEAST_JOINT = 1e-9
 """Smallest ratio of a shift: ratios are differences, and rounding may make them 0."""
+
+BATCH = 1024
+"""Ratios whose logs are computed together."""
+
+
+class RatioBatch(NamedTuple):
+    """Ratios of shifts whose logs are still to be computed; all of length `BATCH`.
+
+    Attributes
+    ----------
+    ratios : RatioWorkspace
+    log : int32
+        Their logs, in units of `fixed_point.QUANTUM`.
+    single : int32
+        The sum of the logs of the two flips, in the same units.
+    times : int32
+        Multiplicity of the reading.
+    at : int64
+        Index of the sum to add to.
+    """
+
+    ratios: RatioWorkspace
+    log: NDArray[np.int32]
+    single: NDArray[np.int32]
+    times: NDArray[np.int32]
+    at: NDArray[np.int64]
+
+
+def ratio_batch() -> RatioBatch:
+    """Return an empty batch."""
+    ints = [np.empty(BATCH, np.int32) for _ in range(3)]
+    return RatioBatch(ratio_workspace_for(BATCH), *ints, np.empty(BATCH, np.int64))
 
 
 @kernel
@@ -55,7 +86,7 @@ def mark_observing(s: State, cells: NDArray[np.int64], observing: Any) -> None:
             observing[s.observing[i, 0]] = 1
 
 
-@kernel
+@inlined_kernel
 def _in_runs(pairs: Pairs, at: int, runs: int, c: int) -> bool:
     for k in range(at, at + WORDS_PER_RUN * runs, WORDS_PER_RUN):
         if c <= pairs.cell[k + 1]:
@@ -64,44 +95,78 @@ def _in_runs(pairs: Pairs, at: int, runs: int, c: int) -> bool:
 
 
 @kernel
+def _any_in_runs(pairs: Pairs, at: int, end: Any, slot: Any) -> bool:
+    """Return whether any cell of the runs from index `at` to `end` has a row of `joint`."""
+    found = 0
+    for k in range(np.uint64(at), end, np.uint64(WORDS_PER_RUN)):
+        for c in range(np.uint64(pairs.cell[k]), np.uint64(pairs.cell[k + np.uint64(1)]) + np.uint64(1)):
+            # without a branch, so that the compiler vectorises it
+            found |= slot[c] >= 0
+    return found != 0
+
+
+@inlined_kernel
 def _add_joint(
-    s: State, reading_state: Any, pairs: Pairs, at: int, cell: tuple[int, int], place: Any, joint: Any
-) -> None:
-    """Add the log ratio of shifting a cell to each of its neighbours, minus those of the two flips, to `joint` (8,).
+    s: State,
+    t: int,
+    pairs: Pairs,
+    at: int,
+    cell: tuple[int, int, int],
+    place: Any,
+    batch: RatioBatch,
+    n: int,
+) -> int:
+    """Add the ratios of shifting a cell to each of its neighbours to the first n of `batch`; return their number.
 
     Parameters
     ----------
+    t
+        The reading; its ratios must be in the workspace (`compute_ratios`).
     cell
-        The cell, and its index in the band, or -1 if it is in the free zone.
+        The cell, its index in the band, or -1 if it is in the free zone, and its row of `joint`.
     place : int32, shape (cells,)
         Index of each cell in the band, -1 outside of it.
     """
-    c, here = cell
+    c, here, row = cell
     height, width = s.lattice.height, s.lattice.width
     q = 1.0 - s.model.p_hit
+    reading_state, ratios = s.reading_states[t], s.workspace.ratios.ratio
     logs = at + WORDS_PER_RUN * reading_state.runs + 2 * reading_state.bands
     own = pairs.log[logs + here] if here >= 0 else reading_state.release
-    ratio = math.exp(own * QUANTUM)
+    # in the free zone, the ratio of occupying a cell, and that of freeing one, follow those of the band
+    occupy = reading_state.bands
+    ratio = ratios[here if here >= 0 else occupy + 1]
     for k in range(NEIGHBOURS):
         o = neighbour(c, k, height, width)
         if o < 0 or s.maps.occupied[o]:
             continue
         there = place[o]
         if there >= 0:
-            log = pairs.log[logs + there]
-            other = math.exp(log * QUANTUM)
+            log, other = pairs.log[logs + there], ratios[there]
             together = ratio + (other - 1.0) / q if there > here else other + q * (ratio - 1.0)
         elif _in_runs(pairs, at, reading_state.runs, o):
             log = reading_state.occupy
-            together = math.exp(log * QUANTUM) + q * (ratio - 1.0) if here >= 0 else 1.0
+            together = ratios[occupy] + q * (ratio - 1.0) if here >= 0 else 1.0
         else:
             continue
-        gain = math.log(max(together, LEAST_JOINT)) / QUANTUM - own - log
-        joint[k] += reading_state.multiplicity * int(math.floor(gain + 0.5))
+        batch.ratios.ratio[n] = max(together, LEAST_JOINT)
+        batch.single[n] = own + log
+        batch.times[n] = reading_state.multiplicity
+        batch.at[n] = NEIGHBOURS * row + k
+        n += 1
+    return n
 
 
 @kernel
-def try_shifts(s: State, readings: Any, slot: Any, place: Any, joint: Any) -> None:
+def _sum_batch(batch: RatioBatch, n: int, joint: Any) -> None:
+    """Add the logs of the first n ratios of a batch, minus those of the two flips, to `joint` (flat)."""
+    quantise_logs(batch.ratios, n, batch.log)
+    for i in range(n):
+        joint[batch.at[i]] += batch.times[i] * np.int64(batch.log[i] - batch.single[i])
+
+
+@kernel
+def try_shifts(s: State, readings: Any, slot: Any, place: Any, batch: RatioBatch, joint: Any) -> None:
     """Add the log ratios of shifts by some readings, minus those of the two flips, in units of `fixed_point.QUANTUM`.
 
     Parameters
@@ -112,38 +177,50 @@ def try_shifts(s: State, readings: Any, slot: Any, place: Any, joint: Any) -> No
         Row of `joint` of each cell whose shifts are tried, -1 for others.
     place : int32, shape (cells,)
         Workspace; all -1 before and after the call.
-    joint : int64, shape (rows, 8)
+    batch : RatioBatch
+        Workspace.
+    joint : int64, shape (rows * 8,)
         Sums by cell and neighbour; they are meaningless for occupied neighbours.
     """
     workspace = s.workspace
+    # always of the same type, so that callees are compiled once
+    waiting: Any = np.int64(0)
     for t in readings:
         if s.stop[0]:
             break
         reading_state = s.reading_states[t]
         pairs, at = pairs_with_logs(s, t)
-        cells = at + WORDS_PER_RUN * reading_state.runs
+        cells = np.uint64(at + WORDS_PER_RUN * reading_state.runs)
         n = 0
-        for k in range(reading_state.bands):
-            if slot[pairs.cell[cells + k]] >= 0:
-                workspace.bucket[n] = k
-                n += 1
-        if not n and not reading_state.blocking:
+        for k in range(np.uint64(reading_state.bands)):
+            # without a branch, since it would often be predicted wrongly
+            workspace.bucket[n] = k
+            n += slot[pairs.cell[cells + k]] >= 0
+        if not n and not (reading_state.blocking and _any_in_runs(pairs, at, cells, slot)):
             continue
-        for k in range(reading_state.bands):
+        compute_ratios(s.model, reading_state, s.maps.occupied, pairs, at, workspace)
+        for k in range(np.uint64(reading_state.bands)):
             place[pairs.cell[cells + k]] = k
         for i in range(n):
             k = workspace.bucket[i]
             c = pairs.cell[cells + k]
-            cell: Any = np.int64(c), np.int64(k)
-            _add_joint(s, reading_state, pairs, at, cell, place, joint[slot[c]])
+            cell: Any = np.int64(c), np.int64(k), np.int64(slot[c])
+            waiting = _add_joint(s, t, pairs, at, cell, place, batch, waiting)
+            if waiting > BATCH - NEIGHBOURS:
+                _sum_batch(batch, waiting, joint)
+                waiting = np.int64(0)
         if reading_state.blocking:
-            for k in range(at, cells, WORDS_PER_RUN):
-                for c in range(pairs.cell[k], pairs.cell[k + 1] + 1):
+            for k in range(np.uint64(at), cells, np.uint64(WORDS_PER_RUN)):
+                for c in range(np.uint64(pairs.cell[k]), np.uint64(pairs.cell[k + np.uint64(1)]) + np.uint64(1)):
                     if slot[c] >= 0:
-                        cell = np.int64(c), np.int64(-1)
-                        _add_joint(s, reading_state, pairs, at, cell, place, joint[slot[c]])
-        for k in range(reading_state.bands):
+                        cell = np.int64(c), np.int64(-1), np.int64(slot[c])
+                        waiting = _add_joint(s, t, pairs, at, cell, place, batch, waiting)
+                        if waiting > BATCH - NEIGHBOURS:
+                            _sum_batch(batch, waiting, joint)
+                            waiting = np.int64(0)
+        for k in range(np.uint64(reading_state.bands)):
             place[pairs.cell[cells + k]] = -1
+    _sum_batch(batch, waiting, joint)
 
 
 @allocating_kernel

@@ -12,7 +12,7 @@ from __future__ import annotations
 import math
 from typing import NamedTuple
 
-from ..runtime.jit import kernel
+from ..runtime.jit import inlined_kernel, kernel
 
 HALF_WIDTH = 0.75
 """Smallest half width of a cone for its strength, cells."""
@@ -102,7 +102,7 @@ def make_cone(
     )
 
 
-@kernel
+@inlined_kernel
 def _clip(a: float, b: float, low: float, high: float) -> tuple[float, float]:
     """Clip the interval [low, high] to those u with a * u + b >= 0."""
     if a > 0.0:
@@ -114,7 +114,7 @@ def _clip(a: float, b: float, low: float, high: float) -> tuple[float, float]:
     return low, high
 
 
-@kernel
+@inlined_kernel
 def wedge_run(cone: Cone, row: int) -> tuple[int, int]:
     """Return the first and last column of a row whose cell centres are in the sector; last < first if there is none."""
     v = row + 0.5 - cone.y
@@ -129,7 +129,7 @@ def wedge_run(cone: Cone, row: int) -> tuple[int, int]:
     return int(math.ceil(low + cone.x - 0.5)), int(math.floor(high + cone.x - 0.5))
 
 
-@kernel
+@inlined_kernel
 def axis_run(cone: Cone, row: int) -> tuple[int, int]:
     """Return the first and last column of a row that the axis crosses; last < first if it crosses none."""
     begin, end = 0.0, cone.reach
@@ -144,7 +144,7 @@ def axis_run(cone: Cone, row: int) -> tuple[int, int]:
     return int(math.floor(min(a, b))), int(math.floor(max(a, b)))
 
 
-@kernel
+@inlined_kernel
 def within(x: float, v: float, radius: float) -> tuple[int, int]:
     """Return the first and last column of a row whose centres are at most `radius` away; last < first if none is.
 
@@ -157,13 +157,13 @@ def within(x: float, v: float, radius: float) -> tuple[int, int]:
     return int(math.ceil(x - half - 0.5)), int(math.floor(x + half - 0.5))
 
 
-@kernel
+@inlined_kernel
 def rows_of(cone: Cone, height: int) -> tuple[int, int]:
     """Return the first row of the cone that is on the grid, and the last one plus one."""
     return max(cone.bottom, 0), min(cone.top, height - 1) + 1
 
 
-@kernel
+@inlined_kernel
 def runs_of(cone: Cone, row: int, width: int) -> Runs:
     """Return the cells of the cone in a row of the grid; all loops over a cone use `rows_of` and this."""
     v = row + 0.5 - cone.y
@@ -184,7 +184,7 @@ def runs_of(cone: Cone, row: int, width: int) -> Runs:
     return Runs(c, d, a, b, inner, outer)
 
 
-@kernel
+@inlined_kernel
 def strength(axis_x: float, axis_y: float, sine2: float, du: float, dv: float) -> float:
     """Return the strength of a beam at (du, dv) from its apex: 1 on the axis, 0 at the edge and outside.
 

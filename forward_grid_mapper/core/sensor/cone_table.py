@@ -21,7 +21,7 @@ from ..common.errors import InputError
 from ..common.grid import Grid
 from ..common.parameter_groups import GridParameters, ModelParameters
 from ..common.readings import Readings
-from ..runtime.jit import allocating_kernel, kernel
+from ..runtime.jit import allocating_kernel, inlined_kernel, kernel
 from .cone import Cone, make_cone, rows_of, runs_of
 from .density import CUT
 
@@ -156,7 +156,7 @@ def _exact(cells: Floats) -> Floats:
     return out
 
 
-@kernel
+@inlined_kernel
 def cone_of(reading: Any) -> Cone:
     """Return the sector of a record of `CONE`."""
     axis, half = (reading.axis_x, reading.axis_y), (reading.sine, reading.cosine)

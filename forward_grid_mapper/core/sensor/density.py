@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from ..common.constants import HIT_LENGTH, MOST_HIT
 from ..common.parameter_groups import ModelParameters
 from ..common.readings import Floats, Readings
-from ..runtime.jit import allocating_kernel, kernel
+from ..runtime.jit import allocating_kernel, inlined_kernel
 
 CUT = 4.0
 """σ beyond which the noise density is set to 0, so that distances of few cells are needed: there it is 3e-4 of its
@@ -50,7 +50,7 @@ class Causes(NamedTuple):
     max_range: Floats
 
 
-@kernel
+@inlined_kernel
 def density(error: float, sigma: float) -> float:
     """Return N(z; d, σ), 1/m, cut off at `CUT` σ: (22) of the paper.
 

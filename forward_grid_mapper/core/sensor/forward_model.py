@@ -21,7 +21,8 @@ from ..common.grid import Grid
 from ..common.parameter_groups import ModelParameters
 from ..common.readings import Readings
 from ..runtime.jit import allocating_kernel, kernel
-from .cone_table import Cones, Floats, cone_table, walk_resized
+from .cone import rows_of, runs_of
+from .cone_table import Cones, Floats, cone_of, cone_table
 from .density import Causes, causes_of, density
 from .surface_normals import SurfaceNormals, exceeds_incidence_angle, no_normals
 
@@ -70,26 +71,42 @@ def _sort(values: Any, n: int) -> None:
         stride //= 3
 
 
+@kernel
+def _distances(given: _Given, t: int, occupied: Any, out: Any) -> int:
+    """Write the distances of the occupied cells of cone t, without those of surfaces at which it exceeds the angle.
+
+    Returns their number, even if `out` is too short.
+    """
+    normals, cone = given.normals, cone_of(given.cones[t])
+    height, width = occupied.shape
+    # always of the same type, so that callees are compiled once
+    m: Any = np.int64(0)
+    for row in range(*rows_of(cone, height)):
+        v = row + 0.5 - cone.y
+        runs = runs_of(cone, row, width)
+        for first, last in ((runs.first, runs.last), (runs.first2, runs.last2)):
+            for column in range(first, last + 1):
+                if not occupied[row, column]:
+                    continue
+                u, c = column + 0.5 - cone.x, row * width + column
+                if normals.cos2_limit > 0.0 and exceeds_incidence_angle(normals, given.pairing[t], c, u, v):
+                    continue
+                if m < len(out):
+                    out[m] = math.sqrt(u * u + v * v)
+                m += 1
+    return m
+
+
 @allocating_kernel
 def _expect(given: _Given, occupied: Any, out: Any) -> None:
     """Fill `out` (8, N) with the rows of `Expectations`, in its order."""
-    cones, causes, normals = given.cones, given.causes, given.normals
-    height, width = occupied.shape
-    flat = occupied.ravel()
-    cells, distances = np.empty(1024, np.int32), np.empty(1024, np.float64)
+    cones, causes = given.cones, given.causes
+    distances = np.empty(1024)
     for t in range(len(cones)):
-        n, cells, distances = walk_resized(cones, t, (height, width), cells, distances)
-        m = 0
-        for k in range(n):
-            c = cells[k]
-            if flat[c] != 1:
-                continue
-            if normals.cos2_limit > 0.0:
-                u, v = c % width + 0.5 - cones[t].x, c // width + 0.5 - cones[t].y
-                if exceeds_incidence_angle(normals, given.pairing[t], c, u, v):
-                    continue
-            distances[m] = distances[k]
-            m += 1
+        m = _distances(given, t, occupied, distances)
+        if m > len(distances):
+            distances = np.empty(2 * m)
+            m = _distances(given, t, occupied, distances)
         _sort(distances, m)
         sigma = cones[t].sigma
         weight = causes.mixture_weight

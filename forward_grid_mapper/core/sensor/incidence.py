@@ -36,7 +36,7 @@ from ..common.constants import (
 from ..common.grid import Grid, Window
 from ..common.parameter_groups import ModelParameters
 from ..runtime.cancelling import NEVER
-from ..runtime.jit import kernel
+from ..runtime.jit import inlined_kernel, kernel
 from .cone import rows_of, runs_of, strength
 from .cone_table import Cones, cone_of
 from .surface_normals import QUANTUM, Square, SurfaceNormals, square_of, sum_across, touched, unit_of_sums
@@ -134,20 +134,20 @@ def count(
                         counts[zone, slots[c]] += int(unit * math.exp(-0.5 * error * error))
 
 
-@kernel
+@inlined_kernel
 def _rate(echoes: float, passes: float) -> float:
     """Return the fraction of the readings that are echoes, one half without readings."""
     return (echoes + FEW_ECHOES) / (echoes + passes + FEW_READINGS)
 
 
-@kernel
+@inlined_kernel
 def _log_likelihood(echoes: float, passes: float) -> float:
     """Return log L of the maximum likelihood rate."""
     rate = _rate(echoes, passes)
     return echoes * math.log(rate) + passes * math.log(1.0 - rate)
 
 
-@kernel
+@inlined_kernel
 def limit(counts: Any) -> int:
     """Return the last zone in which a surface returns echoes, from its counts: float64, shape (2 · ZONES,)."""
     echoes, passes = 0.0, 0.0

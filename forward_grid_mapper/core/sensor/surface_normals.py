@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 
 from ..common.constants import LEAST_AGREEMENT, LEAST_WEIGHT, NEIGHBOURHOOD, THROUGH, WEIGHT_CELL
 from ..common.grid import Grid, Window
-from ..runtime.jit import kernel
+from ..runtime.jit import inlined_kernel, kernel
 from .cone import rows_of, runs_of
 from .cone_table import Cones, cone_of
 
@@ -159,7 +159,7 @@ def sum_columns(values: Any, row: int, first: int, square: Square, out: Any) -> 
                 out[i] += weight * values[row + k, first + i]
 
 
-@kernel
+@inlined_kernel
 def sum_across(columns: Any, begin: int, square: Square) -> float:
     """Return the sum of the results of `sum_columns` over the width of `NEIGHBOURHOOD`."""
     total = 0.0
@@ -254,7 +254,7 @@ def touched(window: Window, grid: Grid) -> Window:
     return max(bottom - n, 0), min(top + n, grid.height), max(left - n, 0), min(right + n, grid.width)
 
 
-@kernel
+@inlined_kernel
 def exceeds_incidence_angle(normals: SurfaceNormals, reading: Any, c: int, u: float, v: float) -> bool:
     """Return whether a reading passed cell c, at (u, v) from its apex, beyond the limit of the incidence angle."""
     if not normals.known[c]:

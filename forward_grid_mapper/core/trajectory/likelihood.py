@@ -265,7 +265,8 @@ def score_poses(scan: Scan, around: LocalMap, poses: Any, stride: int, lanes: La
     for first in range(0, len(poses), count):
         for t in range(0, len(scan.readings), stride):
             reading = scan.readings[t]
-            begin = 0
+            # always of the same type, so that callees are compiled once
+            begin: Any = np.int64(0)
             while begin < count:
                 end, yaw = begin, poses[first + begin, 2]
                 c, s = math.cos(yaw), math.sin(yaw)
