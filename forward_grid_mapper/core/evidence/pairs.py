@@ -17,7 +17,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ..runtime.jit import kernel
+from ..runtime.jit import inlined_kernel, kernel
 from ..sensor.cone import rows_of, runs_of
 from ..sensor.cone_table import Cones, cone_of
 from ..sensor.density import density
@@ -154,7 +154,7 @@ def make(
     return (n - at) // WORDS_PER_RUN, m
 
 
-@kernel
+@inlined_kernel
 def _sort(workspace: Workspace, m: int) -> None:
     """Sort the first m of `unsorted` by key, into `cell` and `key`; equal keys keep their order.
 

@@ -175,6 +175,9 @@ def count_passes(passed: Any, noticed: Any, p_hit: float, whole: Any, out: Any) 
                 each[j] += noticed[j, k] * passed[k, c]
             each[j] *= UNIT
             least = min(least, each[j])
+        if whole[c] == 0.0:
+            out[c] = 0.0
+            continue
         total = 0.0
         for j in range(len(noticed)):
             total += math.exp(miss * (each[j] - least))

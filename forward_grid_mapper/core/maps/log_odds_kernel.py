@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ..runtime.jit import kernel
+from ..runtime.jit import inlined_kernel, kernel
 from ..sensor.cone import HALF_WIDTH, axis_run, make_cone
 from ..sensor.cone_table import UNIT
 
@@ -78,19 +78,19 @@ class _Ends(NamedTuple):
     occupied: float
 
 
-@kernel
+@inlined_kernel
 def direction_of_yaw(yaw: float, directions: int) -> int:
     """Return which of `directions`, evenly spaced over half a turn, is closest to `yaw`, or to `yaw` + π."""
     return int(math.floor(yaw * directions / math.pi + 0.5)) % directions
 
 
-@kernel
+@inlined_kernel
 def is_steep(direction: int, directions: int) -> bool:
     """Return whether the plane of a direction is stored with x and y exchanged."""
     return directions < 4 * direction < 3 * directions
 
 
-@kernel
+@inlined_kernel
 def _lattice_place(metres: float, resolution: float) -> tuple[int, float]:
     """Return the lattice index of the cell of a coordinate, and the offset within it, cells.
 
@@ -101,7 +101,7 @@ def _lattice_place(metres: float, resolution: float) -> tuple[int, float]:
     return int(cell), cells - cell
 
 
-@kernel
+@inlined_kernel
 def _add_run(
     plane: Any, cells: tuple[int, int], offset: tuple[float, float], beam: tuple[float, float, float], ends: _Ends
 ) -> None:
@@ -143,14 +143,14 @@ class _Edge(NamedTuple):
     high: float
 
 
-@kernel
+@inlined_kernel
 def _edge(x: float, y: float) -> _Edge:
     """Return the edge along the unit vector (x, y) of a cone that lies to the left of it."""
     slope = x / (y if y != 0.0 else -math.copysign(_LEVEL, x))
     return _Edge(slope, -math.inf, 0.0) if y > 0.0 or (y == 0.0 and x < 0.0) else _Edge(slope, 0.0, math.inf)
 
 
-@kernel
+@inlined_kernel
 def _wedge_run(edges: tuple[_Edge, _Edge], reach2: float, x: float, v: float) -> tuple[int, int]:
     """Return the first and last column of a row whose centres lie in the sector, like `cone.wedge_run`."""
     right, left = edges

@@ -12,10 +12,10 @@ from typing import Any
 from ..common.constants import MOST_AGAINST_EXTENSION, STRAIGHT_RUN
 from ..evidence.neighbourhood import NEIGHBOURS, neighbour, opposite
 from ..evidence.state import State
-from ..runtime.jit import kernel
+from ..runtime.jit import inlined_kernel, kernel
 
 
-@kernel
+@inlined_kernel
 def _ahead(c: int, k: int, height: int, width: int, n: int) -> int:
     """Return the cell n steps from c in the direction of neighbour k; -1 outside of the grid."""
     for _ in range(n):

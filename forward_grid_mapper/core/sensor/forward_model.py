@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from ..common.grid import Grid
 from ..common.parameter_groups import ModelParameters
 from ..common.readings import Readings
-from ..runtime.jit import allocating_kernel, kernel
+from ..runtime.jit import allocating_kernel, inlined_kernel
 from .cone import rows_of, runs_of
 from .cone_table import Cones, Floats, cone_of, cone_table
 from .density import Causes, causes_of, density
@@ -55,7 +55,7 @@ class _Given(NamedTuple):
     resolution: float
 
 
-@kernel
+@inlined_kernel
 def _sort(values: Any, n: int) -> None:
     """Sort the first n values in place by Shell sort: they are few, and partly sorted."""
     stride = 1
@@ -71,7 +71,7 @@ def _sort(values: Any, n: int) -> None:
         stride //= 3
 
 
-@kernel
+@inlined_kernel
 def _distances(given: _Given, t: int, occupied: Any, out: Any) -> int:
     """Write the distances of the occupied cells of cone t, without those of surfaces at which it exceeds the angle.
 

@@ -10,14 +10,14 @@ from typing import Any
 
 import numpy as np
 
-from ..runtime.jit import kernel
+from ..runtime.jit import inlined_kernel, kernel
 from .poses import Floats
 
 TINY = 1e-300
 """Smallest probability of a state, so that later votes can still raise it."""
 
 
-@kernel
+@inlined_kernel
 def move(belief: Any, density: Any, other: float, out: Any) -> None:
     """Write the belief after a motion to `out`: the prediction step of the Bayes filter.
 

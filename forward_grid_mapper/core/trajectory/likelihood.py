@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from ..common.constants import THROUGH
 from ..common.parameter_groups import ModelParameters
 from ..common.readings import Readings
-from ..runtime.jit import kernel
+from ..runtime.jit import inlined_kernel, kernel
 from ..sensor.cone_table import effective_sigma, reach_of
 from ..sensor.density import CUT, causes_of, density
 from .local_map import LocalMap
@@ -67,7 +67,7 @@ class Scan(NamedTuple):
     weight: float
 
 
-@kernel
+@inlined_kernel
 def _log_unknown(reading: Any, weight: float, resolution: float, unknown: float) -> float:
     """Return log p(z) on a map without known cells."""
     survival, hit = 1.0, 0.0
@@ -162,7 +162,7 @@ def _lanes(count: int) -> Lanes:
     return Lanes(x, y, fan, best, ray, survival, hit, cell, met)
 
 
-@kernel
+@inlined_kernel
 def _fan_out(reading: Any, yaw: float, resolution: float, lanes: Lanes, part: tuple[int, int]) -> None:
     """Set the rays of a reading in the lanes `part[0]` to `part[1]`, which have the same yaw."""
     fan, begin = lanes.fan, yaw + reading.yaw - reading.half
@@ -181,7 +181,7 @@ def _fan_out(reading: Any, yaw: float, resolution: float, lanes: Lanes, part: tu
             u, v = u * c - v * s, u * s + v * c
 
 
-@kernel
+@inlined_kernel
 def _meet(around: LocalMap, lanes: Lanes, wide: int, rays: int, d: float) -> None:
     """Look up the cells that the rays of each lane meet at distance d, cells."""
     x, y, fan, cell, met, cells = lanes.x, lanes.y, lanes.fan, lanes.cell, lanes.met, around.cells
@@ -196,7 +196,7 @@ def _meet(around: LocalMap, lanes: Lanes, wide: int, rays: int, d: float) -> Non
             met[k, 0, p], met[k, 1, p], met[k, 2, p] = cells[at, 0], cells[at, 1], cells[at, 2]
 
 
-@kernel
+@inlined_kernel
 def _raise(around: LocalMap, lanes: Lanes, wide: int, rays: int, limit: float) -> None:
     """Find the largest probability that the rays of each lane meet."""
     best, ray, fan, cell, met = lanes.best, lanes.ray, lanes.fan, lanes.cell, lanes.met
@@ -215,7 +215,7 @@ def _raise(around: LocalMap, lanes: Lanes, wide: int, rays: int, limit: float) -
             ray[p] = this if more & (not beyond) else ray[p]
 
 
-@kernel
+@inlined_kernel
 def _hear(reading: Any, resolution: float, lanes: Lanes, wide: int, d: float) -> None:
     """Add s_d h_d N(z; d, σ) of a ring."""
     x, y, fan = lanes.x, lanes.y, lanes.fan
@@ -231,7 +231,7 @@ def _hear(reading: Any, resolution: float, lanes: Lanes, wide: int, d: float) ->
             lanes.hit[p] += lanes.survival[p] * lanes.best[p] * density(error, reading.sigma)
 
 
-@kernel
+@inlined_kernel
 def _walk(reading: Any, around: LocalMap, lanes: Lanes) -> None:
     """Go through the rings of the cone of a reading, in all lanes."""
     resolution, best, survival = around.resolution, lanes.best, lanes.survival

@@ -27,7 +27,15 @@ from forward_grid_mapper.core.search.flips import (
 )
 from forward_grid_mapper.core.search.prior import Prior
 from forward_grid_mapper.core.search.search import LEAST
-from forward_grid_mapper.core.search.shifts import best_shifts, mark_observing, shift_in_order, try_shifts, unsettle
+from forward_grid_mapper.core.search.shifts import (
+    BATCH,
+    best_shifts,
+    mark_observing,
+    ratio_batch,
+    shift_in_order,
+    try_shifts,
+    unsettle,
+)
 from forward_grid_mapper.core.sensor.forward_model import expectations, log_likelihood
 from samples import plain_model, random_readings
 
@@ -208,11 +216,11 @@ def test_unneeded_occupied_cells_are_freed_one_after_the_other(seed: int, tolera
 def joints(evidence: Evidence, cells: np.ndarray, readings: np.ndarray | None = None) -> np.ndarray:
     slot = np.full(GRID.size, -1, np.int32)
     slot[cells] = np.arange(len(cells))
-    place, joint = np.full(GRID.size, -1, np.int32), np.zeros((len(cells), 8), np.int64)
+    place, joint = np.full(GRID.size, -1, np.int32), np.zeros(len(cells) * 8, np.int64)
     which = np.arange(len(evidence)) if readings is None else readings
-    try_shifts(evidence.state, which, slot, place, joint)
+    try_shifts(evidence.state, which, slot, place, ratio_batch(), joint)
     assert (place == -1).all()
-    return joint
+    return joint.reshape(-1, 8)
 
 
 def positions(evidence: Evidence, t: int, c: int, o: int) -> str:
@@ -262,6 +270,18 @@ def test_joint_gain_of_a_reading_is_the_difference_of_two_evaluations(filled: fl
     wanted = {'band band behind', 'band band before', 'free free', 'free band', 'band free', 'off off'}
     wanted |= {'off band', 'band off', 'off free', 'free off'}
     assert set(tried) == wanted
+
+
+@pytest.mark.parametrize('memory', [math.inf, 0.0])
+@pytest.mark.parametrize('filled', [0.15, 0.6])
+def test_joint_gains_of_more_ratios_than_a_batch_are_the_sums_over_single_readings(
+    filled: float, memory: float
+) -> None:
+    evidence, readings = random_case(1, 400, memory, filled)
+    cells = np.flatnonzero(evidence.state.maps.occupied)
+    single = [joints(evidence, cells, np.array([t])) for t in range(len(readings))]
+    assert sum(np.count_nonzero(joint) for joint in single) > 2 * BATCH
+    assert np.array_equal(joints(evidence, cells), sum(single))
 
 
 @pytest.mark.parametrize('memory', [math.inf, 0.0])
