@@ -199,7 +199,7 @@ def table_2(runs: int) -> None:
     loops = [table2.search(readings, parameters) for _ in range(runs)]
     seconds, one = statistics.median(loop.seconds for loop in loops), loops[0]
     objective = log_likelihood(readings, one.grid, one.occupied, parameters.model) + prior * int(one.occupied.sum())
-    print(f'{"":10s}{"seconds":>9s}{"sweeps":>8s}{"flips":>8s}{"casts":>12s}{"us a cast":>11s}{"objective":>11s}')
+    print(f'{"":10s}{"seconds":>9s}{"rounds":>8s}{"flips":>8s}{"casts":>12s}{"us a cast":>11s}{"objective":>11s}')
     print(
         f'{"Table 2":10s}{seconds:9.2f}{one.sweeps:8d}{one.flips:8d}{one.casts:12d}{seconds / one.casts * 1e6:11.2f}'
         f'{objective:11.1f}'

@@ -22,7 +22,7 @@ _EXPONENT = np.int32(23)
 
 
 class RatioWorkspace(NamedTuple):
-    """Workspace for the likelihood ratios of one cone, and views of their bits; arrays of the same length."""
+    """Workspace for likelihood ratios, as those of a cone, and views of their bits; arrays of the same length."""
 
     ratio: NDArray[np.float32]
     ratio_bits: NDArray[np.int32]
@@ -31,7 +31,7 @@ class RatioWorkspace(NamedTuple):
 
 
 def ratio_workspace_for(largest: int) -> RatioWorkspace:
-    """Return a workspace for cones of up to `largest` cells."""
+    """Return a workspace for cones of up to `largest` cells: room for as many ratios, and three more."""
     ratio, mantissa = np.empty(largest + 3, np.float32), np.empty(largest + 3, np.float32)
     return RatioWorkspace(ratio, ratio.view(np.int32), mantissa, mantissa.view(np.int32))
 

@@ -69,11 +69,11 @@ class Workspace(NamedTuple):
     pairs : Pairs
         For its pairs, if they are not stored.
     ratios : RatioWorkspace
-        For the likelihood ratios of its cells.
+        For the likelihood ratios of its cells, and three more (`updates.compute_ratios`).
     new : int32
-        For their logs, and those of three more ratios (`updates.evaluate`).
+        For their logs; before that, for the obstacles in its band.
     cell, key, unsorted, unsorted_key, tally, bucket
-        For sorting its band.
+        For sorting its band; when shifts are tried, `bucket` has the cells to be shifted.
     """
 
     pairs: Pairs

@@ -116,17 +116,32 @@ def pairs_of(s: State, t: int) -> tuple[Pairs, int]:
     return (s.pairs, reading_state.at) if reading_state.stored else (s.workspace.pairs, 0)
 
 
+@kernel
+def _make_logs(s: State, t: int, pairs: Pairs, at: int) -> None:
+    """Write the logs of a reading that is not stored, for the present map; its ratios stay in the workspace."""
+    reading_state = s.reading_states[t]
+    evaluate(s.model, reading_state, s.maps.occupied, pairs, at, s.workspace)
+    log = at + WORDS_PER_RUN * reading_state.runs + 2 * reading_state.bands
+    for k in range(reading_state.bands):
+        pairs.log[log + k] = s.workspace.new[k]
+
+
 @inlined_kernel
 def pairs_with_logs(s: State, t: int) -> tuple[Pairs, int]:
     """Do the same as `pairs_of`, with the logs for the present map."""
     pairs, at = pairs_of(s, t)
-    reading_state = s.reading_states[t]
-    if not reading_state.stored:
-        evaluate(s.model, reading_state, s.maps.occupied, pairs, at, s.workspace)
-        log = at + WORDS_PER_RUN * reading_state.runs + 2 * reading_state.bands
-        for k in range(reading_state.bands):
-            pairs.log[log + k] = s.workspace.new[k]
+    if not s.reading_states[t].stored:
+        _make_logs(s, t, pairs, at)
     return pairs, at
+
+
+@inlined_kernel
+def ratios_and_logs(s: State, t: int, pairs: Pairs, at: int) -> None:
+    """Write the ratios for the present map to the workspace; make the logs of pairs from `pairs_of` without logs."""
+    if s.reading_states[t].stored:
+        compute_ratios(s.model, s.reading_states[t], s.maps.occupied, pairs, at, s.workspace)
+    else:
+        _make_logs(s, t, pairs, at)
 
 
 @inlined_kernel

@@ -176,6 +176,7 @@ def count_passes(passed: Any, noticed: Any, p_hit: float, whole: Any, out: Any) 
             each[j] *= UNIT
             least = min(least, each[j])
         if whole[c] == 0.0:
+            # most cells of a map, and logarithms take most of the time
             out[c] = 0.0
             continue
         total = 0.0

@@ -95,7 +95,12 @@ def kernel(function: F) -> F:
 
 
 def inlined_kernel(function: F) -> F:
-    """Do the same as `kernel`, for a function that the compiler inserts into its callers."""
+    """Do the same as `kernel`, for a function that the compiler inserts into the kernels that call it.
+
+    For functions that are called for each reading or cell: passing them a tuple of dozens of arrays takes longer than
+    their work. Numba makes a type of its own of a literal, and compiles a function again for it; so callers pass
+    `np.int64(0)` in place of 0, where this would happen.
+    """
     return _compiled(function, _nrt=False, forceinline=True)
 
 

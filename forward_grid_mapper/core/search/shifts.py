@@ -22,7 +22,7 @@ from ..evidence.fixed_point import RatioWorkspace, quantise_logs, ratio_workspac
 from ..evidence.neighbourhood import NEIGHBOURS, neighbour, note_flip
 from ..evidence.pairs import WORDS_PER_RUN, Pairs
 from ..evidence.state import State
-from ..evidence.updates import compute_ratios, find_observing, flip, pairs_of, pairs_with_logs
+from ..evidence.updates import find_observing, flip, pairs_of, ratios_and_logs
 from ..runtime.jit import allocating_kernel, inlined_kernel, kernel
 from ..sensor.cone_table import Floats
 from .flips import Least, gain_of, least_gain
@@ -36,10 +36,12 @@ BATCH = 1024
 
 
 class RatioBatch(NamedTuple):
-    """Ratios of shifts whose logs are still to be computed; all of length `BATCH`.
+    """Ratios of shifts whose logs are still to be computed, up to `BATCH`.
 
     Attributes
     ----------
+    waiting : int64, shape (1,)
+        Their number.
     ratios : RatioWorkspace
     log : int32
         Their logs, in units of `fixed_point.QUANTUM`.
@@ -51,6 +53,7 @@ class RatioBatch(NamedTuple):
         Index of the sum to add to.
     """
 
+    waiting: NDArray[np.int64]
     ratios: RatioWorkspace
     log: NDArray[np.int32]
     single: NDArray[np.int32]
@@ -61,7 +64,7 @@ class RatioBatch(NamedTuple):
 def ratio_batch() -> RatioBatch:
     """Return an empty batch."""
     ints = [np.empty(BATCH, np.int32) for _ in range(3)]
-    return RatioBatch(ratio_workspace_for(BATCH), *ints, np.empty(BATCH, np.int64))
+    return RatioBatch(np.zeros(1, np.int64), ratio_workspace_for(BATCH), *ints, np.empty(BATCH, np.int64))
 
 
 @kernel
@@ -88,6 +91,7 @@ def mark_observing(s: State, cells: NDArray[np.int64], observing: Any) -> None:
 
 @inlined_kernel
 def _in_runs(pairs: Pairs, at: int, runs: int, c: int) -> bool:
+    """Return whether cell c is in one of the runs from index `at` on."""
     for k in range(at, at + WORDS_PER_RUN * runs, WORDS_PER_RUN):
         if c <= pairs.cell[k + 1]:
             return bool(c >= pairs.cell[k])
@@ -96,7 +100,7 @@ def _in_runs(pairs: Pairs, at: int, runs: int, c: int) -> bool:
 
 @kernel
 def _any_in_runs(pairs: Pairs, at: int, end: Any, slot: Any) -> bool:
-    """Return whether any cell of the runs from index `at` to `end` has a row of `joint`."""
+    """Return whether any cell of the runs from index `at` to `end` is set in `slot`."""
     found = 0
     for k in range(np.uint64(at), end, np.uint64(WORDS_PER_RUN)):
         for c in range(np.uint64(pairs.cell[k]), np.uint64(pairs.cell[k + np.uint64(1)]) + np.uint64(1)):
@@ -106,22 +110,15 @@ def _any_in_runs(pairs: Pairs, at: int, end: Any, slot: Any) -> bool:
 
 
 @inlined_kernel
-def _add_joint(
-    s: State,
-    t: int,
-    pairs: Pairs,
-    at: int,
-    cell: tuple[int, int, int],
-    place: Any,
-    batch: RatioBatch,
-    n: int,
-) -> int:
-    """Add the ratios of shifting a cell to each of its neighbours to the first n of `batch`; return their number.
+def _collect(
+    s: State, t: int, pairs: Pairs, at: int, cell: tuple[int, int, int], place: Any, batch: RatioBatch
+) -> None:
+    """Add the ratios of shifting a cell to each of its neighbours to `batch`, which must have room for them.
 
     Parameters
     ----------
     t
-        The reading; its ratios must be in the workspace (`compute_ratios`).
+        The reading; its ratios must be in the workspace (`ratios_and_logs`).
     cell
         The cell, its index in the band, or -1 if it is in the free zone, and its row of `joint`.
     place : int32, shape (cells,)
@@ -129,7 +126,7 @@ def _add_joint(
     """
     c, here, row = cell
     height, width = s.lattice.height, s.lattice.width
-    q = 1.0 - s.model.p_hit
+    q, n = 1.0 - s.model.p_hit, batch.waiting[0]
     reading_state, ratios = s.reading_states[t], s.workspace.ratios.ratio
     logs = at + WORDS_PER_RUN * reading_state.runs + 2 * reading_state.bands
     own = pairs.log[logs + here] if here >= 0 else reading_state.release
@@ -154,15 +151,24 @@ def _add_joint(
         batch.times[n] = reading_state.multiplicity
         batch.at[n] = NEIGHBOURS * row + k
         n += 1
-    return n
+    batch.waiting[0] = n
 
 
 @kernel
-def _sum_batch(batch: RatioBatch, n: int, joint: Any) -> None:
-    """Add the logs of the first n ratios of a batch, minus those of the two flips, to `joint` (flat)."""
+def _sum_batch(batch: RatioBatch, joint: Any) -> None:
+    """Add the logs of the ratios of a batch, minus those of the two flips, to `joint` (flat), and empty it."""
+    n = batch.waiting[0]
     quantise_logs(batch.ratios, n, batch.log)
     for i in range(n):
         joint[batch.at[i]] += batch.times[i] * np.int64(batch.log[i] - batch.single[i])
+    batch.waiting[0] = 0
+
+
+@inlined_kernel
+def _sum_full_batch(batch: RatioBatch, joint: Any) -> None:
+    """Do the same if there is no room for the ratios of another cell."""
+    if batch.waiting[0] > BATCH - NEIGHBOURS:
+        _sum_batch(batch, joint)
 
 
 @kernel
@@ -178,18 +184,16 @@ def try_shifts(s: State, readings: Any, slot: Any, place: Any, batch: RatioBatch
     place : int32, shape (cells,)
         Workspace; all -1 before and after the call.
     batch : RatioBatch
-        Workspace.
+        Workspace; empty before and after the call.
     joint : int64, shape (rows * 8,)
         Sums by cell and neighbour; they are meaningless for occupied neighbours.
     """
     workspace = s.workspace
-    # always of the same type, so that callees are compiled once
-    waiting: Any = np.int64(0)
     for t in readings:
         if s.stop[0]:
             break
         reading_state = s.reading_states[t]
-        pairs, at = pairs_with_logs(s, t)
+        pairs, at = pairs_of(s, t)
         cells = np.uint64(at + WORDS_PER_RUN * reading_state.runs)
         n = 0
         for k in range(np.uint64(reading_state.bands)):
@@ -198,29 +202,25 @@ def try_shifts(s: State, readings: Any, slot: Any, place: Any, batch: RatioBatch
             n += slot[pairs.cell[cells + k]] >= 0
         if not n and not (reading_state.blocking and _any_in_runs(pairs, at, cells, slot)):
             continue
-        compute_ratios(s.model, reading_state, s.maps.occupied, pairs, at, workspace)
+        ratios_and_logs(s, t, pairs, at)
         for k in range(np.uint64(reading_state.bands)):
             place[pairs.cell[cells + k]] = k
         for i in range(n):
             k = workspace.bucket[i]
             c = pairs.cell[cells + k]
             cell: Any = np.int64(c), np.int64(k), np.int64(slot[c])
-            waiting = _add_joint(s, t, pairs, at, cell, place, batch, waiting)
-            if waiting > BATCH - NEIGHBOURS:
-                _sum_batch(batch, waiting, joint)
-                waiting = np.int64(0)
+            _collect(s, t, pairs, at, cell, place, batch)
+            _sum_full_batch(batch, joint)
         if reading_state.blocking:
             for k in range(np.uint64(at), cells, np.uint64(WORDS_PER_RUN)):
                 for c in range(np.uint64(pairs.cell[k]), np.uint64(pairs.cell[k + np.uint64(1)]) + np.uint64(1)):
                     if slot[c] >= 0:
                         cell = np.int64(c), np.int64(-1), np.int64(slot[c])
-                        waiting = _add_joint(s, t, pairs, at, cell, place, batch, waiting)
-                        if waiting > BATCH - NEIGHBOURS:
-                            _sum_batch(batch, waiting, joint)
-                            waiting = np.int64(0)
+                        _collect(s, t, pairs, at, cell, place, batch)
+                        _sum_full_batch(batch, joint)
         for k in range(np.uint64(reading_state.bands)):
             place[pairs.cell[cells + k]] = -1
-    _sum_batch(batch, waiting, joint)
+    _sum_batch(batch, joint)
 
 
 @allocating_kernel

@@ -73,14 +73,13 @@ def _sort(values: Any, n: int) -> None:
 
 @inlined_kernel
 def _distances(given: _Given, t: int, occupied: Any, out: Any) -> int:
-    """Write the distances of the occupied cells of cone t, without those of surfaces at which it exceeds the angle.
+    """Write the distances of the occupied cells of cone t, without surfaces beyond the limit of the incidence angle.
 
     Returns their number, even if `out` is too short.
     """
     normals, cone = given.normals, cone_of(given.cones[t])
     height, width = occupied.shape
-    # always of the same type, so that callees are compiled once
-    m: Any = np.int64(0)
+    m = 0
     for row in range(*rows_of(cone, height)):
         v = row + 0.5 - cone.y
         runs = runs_of(cone, row, width)
