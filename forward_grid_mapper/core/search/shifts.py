@@ -63,8 +63,14 @@ class RatioBatch(NamedTuple):
 
 def ratio_batch() -> RatioBatch:
     """Return an empty batch."""
-    ints = [np.empty(BATCH, np.int32) for _ in range(3)]
-    return RatioBatch(np.zeros(1, np.int64), ratio_workspace_for(BATCH), *ints, np.empty(BATCH, np.int64))
+    return RatioBatch(
+        waiting=np.zeros(1, np.int64),
+        ratios=ratio_workspace_for(BATCH),
+        log=np.empty(BATCH, np.int32),
+        single=np.empty(BATCH, np.int32),
+        times=np.empty(BATCH, np.int32),
+        at=np.empty(BATCH, np.int64),
+    )
 
 
 @kernel
