@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 import pytest
-from pentagon_drive import bent_by, exact_drive, quietly, scans_of
+from pentagon_drive import quietly
 
 from forward_grid_mapper.core.common.errors import InputError
 from forward_grid_mapper.core.trajectory import any_angle, scan_matching
@@ -16,24 +16,7 @@ from forward_grid_mapper.core.trajectory.pose_graph import Solution, solution_at
 from forward_grid_mapper.core.trajectory.poses import Floats, relative
 from forward_grid_mapper.core.trajectory.scan_matching import TRUSTS
 from forward_grid_mapper.core.trajectory.scans import Scans
-from forward_grid_mapper.core.trajectory.windows import Odometry
 from forward_grid_mapper.simulation.drift import odometry_of
-from forward_grid_mapper.simulation.drive import Recording
-
-
-@pytest.fixture(scope='module')
-def exact() -> Recording:
-    return exact_drive()
-
-
-@pytest.fixture(scope='module')
-def bent() -> tuple[Recording, Odometry]:
-    return bent_by(exact_drive(), 'high', 5)
-
-
-@pytest.fixture(scope='module')
-def scans(bent: tuple[Recording, Odometry]) -> Scans:
-    return scans_of(*bent)
 
 
 class Trials:

@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from pentagon_drive import bent_by, exact_drive, quietly, scans_of
+from pentagon_drive import quietly
 
 from forward_grid_mapper.core.common.errors import Cancelled
 from forward_grid_mapper.core.common.parameters import Parameters
@@ -29,21 +29,6 @@ from forward_grid_mapper.simulation.drift import odometry_of
 from forward_grid_mapper.simulation.drive import Recording
 
 TRUST = TRUSTS[0]
-
-
-@pytest.fixture(scope='module')
-def exact() -> Recording:
-    return exact_drive()
-
-
-@pytest.fixture(scope='module')
-def bent() -> tuple[Recording, Odometry]:
-    return bent_by(exact_drive(), 'high', 5)
-
-
-@pytest.fixture(scope='module')
-def scans(bent: tuple[Recording, Odometry]) -> Scans:
-    return scans_of(*bent)
 
 
 @pytest.fixture(scope='module')

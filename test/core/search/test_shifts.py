@@ -1,4 +1,4 @@
-"""Choosing and making moves, compared with plain Python and with evaluations of whole maps."""
+"""Choosing and making shifts, compared with plain Python and with evaluations of whole maps."""
 
 from __future__ import annotations
 
@@ -8,23 +8,13 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from move_cases import GRID, PRIORS, height, model_of, neighbours, prior_of, random_case, seeds
 
 import naive
-from forward_grid_mapper.core.common.grid import Grid
-from forward_grid_mapper.core.common.parameter_groups import ModelParameters
-from forward_grid_mapper.core.common.readings import Readings
 from forward_grid_mapper.core.evidence.evidence import Evidence
 from forward_grid_mapper.core.evidence.fixed_point import QUANTUM
 from forward_grid_mapper.core.evidence.neighbourhood import patterns
 from forward_grid_mapper.core.evidence.updates import flip
-from forward_grid_mapper.core.search.flips import (
-    WORTH_WAITING,
-    any_above,
-    flip_in_order,
-    free_unneeded,
-    highest,
-    promising,
-)
 from forward_grid_mapper.core.search.prior import Prior
 from forward_grid_mapper.core.search.search import LEAST
 from forward_grid_mapper.core.search.shifts import (
@@ -36,181 +26,7 @@ from forward_grid_mapper.core.search.shifts import (
     try_shifts,
     unsettle,
 )
-from forward_grid_mapper.core.sensor.forward_model import expectations, log_likelihood
-from samples import plain_model, random_readings
-
-GRID = Grid(0.1, 0, 0, 12, 9)
-NOTHING = (0.0, 0.0)
-seeds = st.integers(0, 2**32 - 1)
-
-
-def random_case(
-    seed: int, count: int = 40, memory: float = math.inf, filled: float = 0.15
-) -> tuple[Evidence, Readings]:
-    rng = np.random.default_rng(seed)
-    readings = (naive.awkward_readings, random_readings)[seed % 2](rng, GRID, count)
-    # not on the lattice, so that rounding does not decide on which side of the cut a cell is
-    readings.x[:] += 0.001234
-    readings.y[:] -= 0.000777
-    readings.z[:] = np.minimum(readings.z + 0.000345, readings.z_max)
-    readings.sigma[:] *= 1.0017
-    model = plain_model(
-        p_hit=rng.choice([0.05, 0.6, 0.98]),
-        p_rand=rng.choice([0.001, 0.1, 0.4]),
-        p_lost=rng.choice([0.0, 0.25]),
-        sigma=rng.choice([0.01, 0.06]),
-    )
-    evidence = Evidence(GRID, model, memory=memory, start=rng.random(GRID.shape) < filled)
-    evidence.extend(readings)
-    return evidence, readings
-
-
-def model_of(evidence: Evidence) -> ModelParameters:
-    return evidence.model
-
-
-def prior_of(name: str) -> Prior:
-    """A prior in sixteenths of a nat, so that sums are exact in any order."""
-    if name in ('none', 'less'):
-        return Prior(np.full(GRID.size, {'none': 0.0, 'less': -0.5}[name]), np.zeros(256))
-    rng = np.random.default_rng(256)
-    return Prior(rng.integers(-30, -5, GRID.size) / 16, rng.integers(-24, 16, 256) / 16)
-
-
-PRIORS = pytest.mark.parametrize('prior', [prior_of('less'), prior_of('shapes')], ids=['independent', 'shapes'])
-
-
-def height(evidence: Evidence, readings: Readings, prior: Prior) -> float:
-    shaped = evidence.state.maps.occupied.reshape(GRID.shape)
-    return log_likelihood(readings, GRID, shaped, model_of(evidence)) + naive.log_prior(prior, shaped, GRID.shape)
-
-
-def gain(evidence: Evidence, prior: Prior, c: int) -> float:
-    maps = evidence.state.maps
-    return int(maps.evidence[c]) * QUANTUM + naive.prior_gain(prior, maps.occupied, c, GRID.shape)
-
-
-WHOLE = (0, GRID.height, 0, GRID.width)
-
-
-def listed(
-    evidence: Evidence, prior: Prior, least: tuple[float, float] = LEAST, window: tuple[int, int, int, int] = WHOLE
-) -> tuple[np.ndarray, np.ndarray]:
-    cells, gains = np.empty(GRID.size, np.int64), np.empty(GRID.size)
-    n = promising(evidence.state, prior, least, window, cells, gains)
-    return cells[:n], gains[:n]
-
-
-def neighbours(c: int) -> list[int]:
-    row, column = divmod(c, GRID.width)
-    return [
-        y * GRID.width + x
-        for y in range(max(row - 1, 0), min(row + 2, GRID.height))
-        for x in range(max(column - 1, 0), min(column + 2, GRID.width))
-        if (y, x) != (row, column)
-    ]
-
-
-@pytest.mark.parametrize('seed', range(10))
-@pytest.mark.parametrize('name', ['none', 'less', 'shapes'])
-def test_promising_cells_are_those_with_a_gain(seed: int, name: str) -> None:
-    prior = prior_of(name)
-    evidence, _ = random_case(seed)
-    least = (0.01, 0.002)
-    seen = evidence.state.maps.seen
-    cells, gains = listed(evidence, prior, least)
-    assert cells.tolist() == [
-        c for c in range(GRID.size) if seen[c] and gain(evidence, prior, c) > least[0] + least[1] * int(seen[c])
-    ]
-    assert gains.tolist() == [gain(evidence, prior, c) for c in cells]
-    assert len(cells) > 0
-    for bottom, top, left, right in ((2, 5, 3, 11), (0, 9, 4, 4), (8, 9, 0, 12)):
-        inside = [c for c in cells if bottom <= c // GRID.width < top and left <= c % GRID.width < right]
-        assert listed(evidence, prior, least, (bottom, top, left, right))[0].tolist() == inside
-
-
-@pytest.mark.parametrize('seed', range(5))
-@pytest.mark.parametrize('name', ['none', 'less', 'shapes'])
-def test_promising_cells_of_an_empty_map_are_found_at_any_threshold(seed: int, name: str) -> None:
-    rng = np.random.default_rng(seed)
-    prior = prior_of(name)
-    evidence, _ = random_case(seed)
-    maps, least = evidence.state.maps, (0.01, 0.0)
-    maps.occupied[:] = maps.pattern[:] = 0
-    needed = (least[0] - prior.local - prior.shape[0]) / QUANTUM
-    maps.evidence[:] = np.rint(needed) + rng.integers(-3, 4, GRID.size)
-    maps.evidence[rng.random(GRID.size) < 0.9] = -(1 << 40)
-    expected = [c for c in range(GRID.size) if maps.seen[c] and gain(evidence, prior, c) > least[0]]
-    assert listed(evidence, prior, least)[0].tolist() == expected
-
-
-@pytest.mark.parametrize('seed', range(20))
-def test_any_above_finds_blocks_with_promising_or_occupied_cells(seed: int) -> None:
-    rng = np.random.default_rng(seed)
-    size, floor = 200, np.int64(rng.integers(-5, 5))
-    evidence = rng.integers(floor - 6, floor + 2, size)
-    occupied, pattern = ((rng.random(size) < 0.03).astype(np.uint8) * np.uint8(k) for k in (1, 64))
-    for _ in range(50):
-        begin, end = sorted(rng.integers(0, size, 2).tolist())
-        some = any(evidence[c] > floor or occupied[c] or pattern[c] for c in range(begin, end))
-        assert any_above(evidence, occupied, pattern, floor, begin, end) == some
-
-
-@pytest.mark.parametrize('seed', range(10))
-@PRIORS
-def test_local_maxima_are_cells_with_no_better_neighbour(seed: int, prior: Prior) -> None:
-    evidence, _ = random_case(seed)
-    # make ties
-    evidence.state.maps.evidence[:] = evidence.state.maps.evidence >> 23 << 23
-    cells, gains = listed(evidence, prior, NOTHING)
-    room = np.zeros(GRID.size)
-    actual = cells[highest(evidence.state, cells, gains, room)].tolist()
-    assert not room.any()
-    expected = []
-    for c in cells:
-        rivals = [(gain(evidence, prior, o), -o) for o in neighbours(c) if o in cells]
-        if all((gain(evidence, prior, c), -c) > rival for rival in rivals):
-            expected.append(int(c))
-    assert actual == expected
-    assert len(actual) > 0
-    assert not any(set(neighbours(c)) & set(actual) for c in actual), 'no two that are neighbours'
-
-
-@pytest.mark.parametrize('seed', range(10))
-@pytest.mark.parametrize('memory', [math.inf, 0.0])
-@PRIORS
-def test_flips_in_order_stop_without_gain_and_return_the_total_gain(seed: int, memory: float, prior: Prior) -> None:
-    evidence, readings = random_case(seed, memory=memory)
-    twin, _ = random_case(seed)
-    cells, gains = listed(evidence, prior)
-    order = np.argsort(-gains, kind='stable')
-    before = height(evidence, readings, prior)
-    flips, total = flip_in_order(evidence.state, prior, LEAST, cells[order], gains[order])
-    assert height(evidence, readings, prior) - before == pytest.approx(total, abs=1e-6 * len(readings) * max(flips, 1))
-    made, expected = 0, 0.0
-    for c, at_first in zip(cells[order].tolist(), gains[order].tolist(), strict=True):
-        now = gain(twin, prior, c)
-        if now > LEAST[0] + LEAST[1] * twin.state.maps.seen[c] and now > WORTH_WAITING * at_first:
-            flip(twin.state, c)
-            made, expected = made + 1, expected + now
-    assert (flips, total) == (made, expected)
-    assert np.array_equal(evidence.state.maps.occupied, twin.state.maps.occupied)
-
-
-@settings(deadline=None)
-@given(seeds, st.sampled_from([0.0, 0.001, 0.1]))
-def test_unneeded_occupied_cells_are_freed_one_after_the_other(seed: int, tolerance: float) -> None:
-    evidence, _ = random_case(seed, filled=0.4)
-    twin, _ = random_case(seed, filled=0.4)
-    prior, occupied = prior_of('none'), np.flatnonzero(evidence.state.maps.occupied)
-    made, expected = 0, 0.0
-    for c in occupied.tolist():
-        now = gain(twin, prior, c)
-        if twin.state.maps.seen[c] and now >= -tolerance * twin.state.maps.seen[c]:
-            flip(twin.state, c)
-            made, expected = made + 1, expected + now
-    assert free_unneeded(evidence.state, prior, (1.0, tolerance), occupied) == (made, expected)
-    assert np.array_equal(evidence.state.maps.occupied, twin.state.maps.occupied)
+from forward_grid_mapper.core.sensor.forward_model import expectations
 
 
 def joints(evidence: Evidence, cells: np.ndarray, readings: np.ndarray | None = None) -> np.ndarray:
@@ -391,13 +207,11 @@ def test_readings_that_see_a_flip_are_found_and_their_cells_unsettled(
     assert set(np.flatnonzero(settled == 0).tolist()) == unsettled
 
 
-def test_stop_flag_ends_each_loop() -> None:
+def test_stop_flag_ends_shifts() -> None:
     evidence, _ = random_case(1)
-    cells, gains = listed(evidence, prior_of('none'))
     occupied = np.flatnonzero(evidence.state.maps.occupied)
     before = evidence.state.maps.occupied.copy()
     evidence.state.stop[0] = 1
-    assert flip_in_order(evidence.state, prior_of('none'), LEAST, cells, gains) == (0, 0.0)
     assert not joints(evidence, occupied).any()
     assert shift_in_order(evidence.state, prior_of('none'), LEAST, occupied, occupied + 1) == (0, 0.0)
     assert np.array_equal(evidence.state.maps.occupied, before)
