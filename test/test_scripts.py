@@ -88,7 +88,8 @@ def test_command_runs_in_the_working_directory(caller: Caller) -> None:
 
 def test_tests_run_in_the_checkout(caller: Caller) -> None:
     assert caller.run('test', '-k', 'one').returncode == 0
-    assert caller.calls[-1] == f'{ROOT}|-m pytest -n 2 --dist loadfile --no-loadscope-reorder -k one'
+    options = '-n 2 --dist loadfile --no-loadscope-reorder --max-worker-restart 0'
+    assert caller.calls[-1] == f'{ROOT}|-m pytest {options} -k one'
 
 
 def test_missing_venv_is_reported_with_a_remedy(caller: Caller) -> None:

@@ -129,6 +129,11 @@ def flip_in_order(s: State, prior: Prior, least: Least, cells: NDArray[np.int64]
 
 
 def free_unneeded(s: State, prior: Prior, least: Least, cells: NDArray[np.int64]) -> tuple[int, float]:
-    """Free those of some occupied `cells` that can be freed without loss, within rounding; return number and gain."""
+    """Free those of some occupied `cells` that can be freed without loss, within rounding; return number and gain.
+
+    The loss is at most half of what a flip must gain, however many readings observe the cell. Otherwise occupying the
+    cell again would gain, and the search would cycle.
+    """
     cells = cells[s.maps.seen[cells] > 0]
-    return _flip_above(s, prior, cells, np.nextafter(-least[1] * s.maps.seen[cells], -np.inf))
+    rounding = np.minimum(least[1] * s.maps.seen[cells], 0.5 * least[0])
+    return _flip_above(s, prior, cells, np.nextafter(-rounding, -np.inf))

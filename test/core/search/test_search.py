@@ -258,6 +258,27 @@ def test_search_of_many_equally_rounded_readings_converges() -> None:
         assert make(readings, grid, model).run().converged
 
 
+@pytest.mark.parametrize('p_rand', [0.04, 0.11, 0.12])
+def test_freed_cell_of_very_many_readings_is_not_occupied_again(p_rand: float) -> None:
+    # with the first two, occupying the cell gains 0.006 nats more than freeing it loses, by rounding
+    silent, grid, cell = 100_000, Grid(0.1, 0, 0, 16, 1), 5
+    model = plain_model(p_hit=0.05, p_rand=p_rand, p_lost=0.0, sigma=0.05)
+    start = np.arange(grid.size) == cell
+
+    def gain_of_freeing(echoes: int) -> tuple[Readings, float]:
+        z = np.concatenate([np.full(silent, 1.5), np.full(echoes, 0.5)])
+        readings = Readings.from_columns(x=0.05, y=0.05, yaw=0.0, z=z, z_max=1.5, half_angle=0.01)
+        return readings, gain_of(make(readings, grid, model, start=start).evidence.state, independent(0.5, grid), cell)
+
+    (_, none), (_, one) = gain_of_freeing(0), gain_of_freeing(1)
+    readings, gain = gain_of_freeing(math.ceil(none / (none - one)) + 1)
+    for loss in LEAST[1] * len(readings) * np.linspace(0, 1.5, 16):
+        prior = 1 / (1 + math.exp(-gain - loss))
+        result = make(readings, grid, model, start=start, prior=prior, max_iterations=100).refine()
+        assert result.converged
+        assert result.progress.flips <= 1
+
+
 def test_search_can_be_cancelled_before_it_begins_and_at_each_step() -> None:
     readings = random_readings(np.random.default_rng(0), AREA, 400, z_max=2.0)
     steps = make(readings, AREA).run().progress.iterations
