@@ -151,7 +151,7 @@ def _check(options: argparse.Namespace) -> None:
     if options.workers is not None and options.workers < 1:
         raise ParameterError('--workers must be a positive number')
     if options.workers is not None and options.workers > (most := max(WORKERS_A_CORE * cores(), 8)):
-        raise ParameterError(f'--workers {options.workers}: this machine has {cores()} cores; give at most {most}')
+        raise ParameterError(f'--workers {options.workers}: there are {cores()} cores; give at most {most}')
     if options.workers is not None and options.scheduler is not None:
         raise ParameterError('--scheduler has its own workers; leave out --workers')
     if options.scheduler is not None and not re.fullmatch(r'(tcp|tls|ws|wss|ucx)://[^\s/]+:\d+', options.scheduler):

@@ -7,10 +7,10 @@ not begin, or readings and live map would be lost as well.
 from __future__ import annotations
 
 import resource
-from collections.abc import Iterator
 from pathlib import Path
 
 from ..common.parameters import Parameters
+from .control_groups import control_groups
 
 BYTES_A_READING = 400
 """Bytes of the search for each reading, without pairs; twice as much as stored, because arrays are sorted and grow."""
@@ -26,8 +26,11 @@ THREAD_MEMORY = 64_000_000
 """Most bytes of all threads but the first. On maps of some hundred thousand cells and more, arrays for all threads
 would be more, so fewer threads are used; the maps are the same."""
 
-CGROUP, OWN_CGROUPS = Path('/sys/fs/cgroup'), Path('/proc/self/cgroup')
-"""Folder of control groups, and the file with those of this process."""
+NAMES = {
+    1: ('memory.limit_in_bytes', 'memory.usage_in_bytes', 'total_inactive_file'),
+    2: ('memory.max', 'memory.current', 'inactive_file'),
+}
+"""Names of limit, usage and reclaimable memory in a control group, by version."""
 
 NO_LIMIT = 1 << 60
 """A limit of so many bytes or more means no limit: v1 has a large number."""
@@ -79,27 +82,8 @@ def _of_the_process() -> int | None:
 
 def _of_the_group() -> int | None:
     """Return the free bytes in the control groups (v1 or v2) of this process; None if unlimited."""
-    left = [_left_in(folder, *names) for folder, names in _groups()]
+    left = [_left_in(folder, *NAMES[version]) for folder, version in control_groups('memory')]
     return min((value for value in left if value is not None), default=None)
-
-
-def _groups() -> Iterator[tuple[Path, tuple[str, str, str]]]:
-    """Yield the folders of the control groups, and the names of limit, usage and reclaimable memory in them."""
-    second = 'memory.max', 'memory.current', 'inactive_file'
-    first = 'memory.limit_in_bytes', 'memory.usage_in_bytes', 'total_inactive_file'
-    yield CGROUP, second
-    yield CGROUP / 'memory', first
-    try:
-        lines = OWN_CGROUPS.read_text().splitlines()
-    except OSError:
-        return
-    for line in lines:
-        _, controllers, path = [*line.split(':', 2), '', ''][:3]
-        names = second if not controllers else first if 'memory' in controllers.split(',') else None
-        folder = Path(path.lstrip('/'))
-        while names and folder.parts:
-            yield CGROUP / ('memory' if controllers else '') / folder, names
-            folder = folder.parent
 
 
 def _left_in(folder: Path, limit: str, use: str, reclaimable: str) -> int | None:

@@ -3,17 +3,40 @@
 from __future__ import annotations
 
 import itertools
+import math
 import os
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+
+from .control_groups import control_groups
 
 LEAST_PART = 5000
 """Fewest readings for which another thread saves time."""
 
 
 def cores() -> int:
-    """Return the number of cores that this process may use."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, 'sched_getaffinity') else os.cpu_count() or 1
+    """Return the number of cores that this process may use, by its affinity and by the limits of its control groups.
+
+    With more threads than a container may use at once, the kernel would stop all threads of the process from time to
+    time, also those that receive messages.
+    """
+    available = len(os.sched_getaffinity(0)) if hasattr(os, 'sched_getaffinity') else os.cpu_count() or 1
+    limits = (_cores_of(folder, version) for folder, version in control_groups('cpu'))
+    return max(min([available, *(math.floor(limit) for limit in limits if limit is not None)]), 1)
+
+
+def _cores_of(folder: Path, version: int) -> float | None:
+    """Return the limit of cores of a control group; None if there is none."""
+    try:
+        if version == 1:
+            quota, period = ((folder / f'cpu.cfs_{name}_us').read_text() for name in ('quota', 'period'))
+        else:
+            quota, period = (folder / 'cpu.max').read_text().split()
+        # no limit is -1 in version 1, and max, which is no number, in version 2
+        return int(quota) / int(period) if int(quota) > 0 else None
+    except (OSError, ValueError, ZeroDivisionError):
+        return None
 
 
 def parts(begin: int, end: int, threads: int) -> list[tuple[int, int]]:

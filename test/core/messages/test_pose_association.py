@@ -95,16 +95,6 @@ def test_range_above_the_largest_is_no_echo_or_discarded(value: float) -> None:
     assert measure(sonar(range=value), discard) == 'over_range'
 
 
-def test_ranges_of_fixed_distance_rangers() -> None:
-    fixed = sonar(min_range=0.8, max_range=0.8)
-    clear = measure(fixed._replace(range=INF), Parameters().association)
-    detected = measure(fixed._replace(range=-INF), Parameters().association)
-    assert not isinstance(clear, str)
-    assert not isinstance(detected, str)
-    assert clear.z == clear.z_max == 0.8
-    assert 0 < detected.z - 5 * detected.sigma < detected.z + 5 * detected.sigma < 0.8
-
-
 def test_variance_and_parameters_that_override_the_message() -> None:
     p = Parameters.from_flat({'field_of_view': 0.5, 'max_range': 2.0}).association
     measured = measure(sonar(variance=0.04, field_of_view=0.0, range=3.0), p)

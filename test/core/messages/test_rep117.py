@@ -98,9 +98,11 @@ def test_fixed_distance_ranger() -> None:
     fixed = PLAIN._replace(min_range=3.0, max_range=3.0)
     something = measured(fixed._replace(range=-math.inf, variance=0.01))
     assert (something.z, something.sigma) == (1.5, 0.25)
+    assert 0 < something.z - 5 * something.sigma < something.z + 5 * something.sigma < 3.0
     assert rejected_as(fixed._replace(range=-0.5)) == 'below_min_range'
     assert rejected_as(fixed._replace(range=0.0)) == 'too_near'
-    assert measured(fixed._replace(range=math.inf)).z == 3.0
+    clear = measured(fixed._replace(range=math.inf))
+    assert clear.z == clear.z_max == 3.0
 
 
 @pytest.mark.parametrize('value', [math.nan, 0.0, -0.0, -1.0, NEAREST / 2])

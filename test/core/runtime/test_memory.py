@@ -9,7 +9,7 @@ import pytest
 
 from forward_grid_mapper.core.common.parameters import Parameters
 from forward_grid_mapper.core.mapping import Mapper
-from forward_grid_mapper.core.runtime import memory
+from forward_grid_mapper.core.runtime import control_groups
 from forward_grid_mapper.core.runtime import threads as runtime_threads
 from forward_grid_mapper.core.runtime.memory import BYTES_A_CELL, THREAD_MEMORY, free_memory, least_memory, shortage
 from forward_grid_mapper.simulation.drive import corridor_drive, door_drive
@@ -47,7 +47,7 @@ def test_free_memory_is_bounded_by_the_control_group(monkeypatch: pytest.MonkeyP
     free = free_memory()
     assert free is not None
     assert free > 10**6
-    monkeypatch.setattr(memory, 'CGROUP', tmp_path)
+    monkeypatch.setattr(control_groups, 'ROOT', tmp_path)
     (tmp_path / 'memory.max').write_text('5000000\n')
     (tmp_path / 'memory.current').write_text('2000000\n')
     assert free_memory() == 3_000_000
@@ -72,8 +72,8 @@ def test_free_memory_in_a_group_includes_the_page_cache(
     own.write_text(
         '12:cpu,memory:/system.slice/mapper.service\n' if version == 1 else '0::/system.slice/mapper.service\n'
     )
-    monkeypatch.setattr(memory, 'CGROUP', root)
-    monkeypatch.setattr(memory, 'OWN_CGROUPS', own)
+    monkeypatch.setattr(control_groups, 'ROOT', root)
+    monkeypatch.setattr(control_groups, 'OWN', own)
     machine = free_memory()
     assert machine is not None and machine > 10**7
     (group / limit).write_text('9000000\n')

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import itertools
+import os
 import threading
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -15,11 +17,54 @@ from forward_grid_mapper.core.common.parameter_groups import ModelParameters, Se
 from forward_grid_mapper.core.common.parameters import Parameters
 from forward_grid_mapper.core.evidence.evidence import Evidence
 from forward_grid_mapper.core.mapping import Mapper
-from forward_grid_mapper.core.runtime import threads
+from forward_grid_mapper.core.runtime import control_groups, threads
 from forward_grid_mapper.core.search.search import Search, SearchResult
 from samples import PLAIN_MODEL, PLAIN_SEARCH, random_readings
 
 AREA = Grid(0.1, -13, 4, 60, 50)
+
+
+@pytest.mark.parametrize('version', [1, 2])
+def test_cores_are_bounded_by_the_limits_of_all_control_groups(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, version: int
+) -> None:
+    def limit(folder: Path, quota: int | None, period: int = 100_000) -> None:
+        if version == 2:
+            (folder / 'cpu.max').write_text(f'{"max" if quota is None else quota} {period}\n')
+        else:
+            (folder / 'cpu.cfs_quota_us').write_text(f'{-1 if quota is None else quota}\n')
+            (folder / 'cpu.cfs_period_us').write_text(f'{period}\n')
+
+    group = tmp_path / 'groups' / ('cpu' if version == 1 else '') / 'robot.slice' / 'mapper.service'
+    group.mkdir(parents=True)
+    path = '/robot.slice/mapper.service'
+    (tmp_path / 'own').write_text(f'3:memory:/\n12:cpu,cpuacct:{path}\n' if version == 1 else f'0::{path}\n')
+    monkeypatch.setattr(control_groups, 'ROOT', tmp_path / 'groups')
+    monkeypatch.setattr(control_groups, 'OWN', tmp_path / 'own')
+    monkeypatch.setattr(os, 'sched_getaffinity', lambda pid: set(range(8)), raising=False)
+    assert threads.cores() == 8
+    limit(group, None)
+    assert threads.cores() == 8
+    limit(group, 450_000)
+    assert threads.cores() == 4
+    limit(group.parent, 100_000, 50_000)
+    assert threads.cores() == 2
+    limit(group, 50_000)
+    assert threads.cores() == 1
+    limit(group, 1_600_000)
+    limit(group.parent, 1_600_000)
+    assert threads.cores() == 8
+    limit(group.parent.parent, 300_000)
+    assert threads.cores() == 3
+
+
+def test_unreadable_limit_of_cores_is_none(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setattr(control_groups, 'ROOT', tmp_path)
+    monkeypatch.setattr(control_groups, 'OWN', tmp_path / 'absent')
+    monkeypatch.setattr(os, 'sched_getaffinity', lambda pid: {0, 1, 2}, raising=False)
+    for text in ('', 'max', '100000', 'a b', '100000 0', '1 2 3'):
+        (tmp_path / 'cpu.max').write_text(text)
+        assert threads.cores() == 3
 
 
 @given(st.integers(0, 10**7), st.integers(0, 10**7), st.integers(1, 300))
