@@ -168,13 +168,13 @@ class OdometryRecord:
         begin = self._next if self._next < self._size - 2 else 0
         end = min(begin + PART, self._size)
         stay = np.ones(self._size, np.bool_)
-        stay[begin:end] = _hard_to_interpolate(self._stamp[begin:end], self._pose[begin:end])
+        stay[begin:end] = hard_to_interpolate(self._stamp[begin:end], self._pose[begin:end])
         self._next = begin + int(np.count_nonzero(stay[begin:end]))
         self._stamp, self._pose = self._stamp[: self._size][stay], self._pose[: self._size][stay]
         self._size = len(self._stamp)
 
 
-def _hard_to_interpolate(stamp: NDArray[np.int64], pose: Floats) -> NDArray[np.bool_]:
+def hard_to_interpolate(stamp: NDArray[np.int64], pose: Floats) -> NDArray[np.bool_]:
     """Return a mask of the poses that are kept, shape (M,).
 
     Of every second pose, those with the smallest error of interpolation between their neighbours are dropped: at least

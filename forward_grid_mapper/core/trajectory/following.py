@@ -3,7 +3,7 @@
 The last windows make a small pose graph, the *tail*. Its first nodes are fixed (*settled*). The others are determined
 by calibrated odometry, yaws and distances of walls, and loop closures with what was mapped before. So a window takes
 the same time however long the drive is. Only the path, which is copied with each window, and the readings for loop
-closures grow with the drive.
+closures grow with the drive, up to the bounds of odometry (`MOST_POSES`) and of readings (`max_readings`).
 
 The result is checked. Every few windows, the readings of a block are predicted before they are used, with the followed
 correction and with the last proven one. If the followed correction predicts clearly better, it becomes the proven one.
@@ -23,6 +23,8 @@ from numpy.typing import NDArray
 from ..common.parameters import Parameters
 from ..common.readings import Readings, in_canonical_order
 from ..messages.message_types import NANOSECONDS
+from ..messages.odometry_record import MOST_POSES
+from ..messages.thinning import kept
 from ..runtime.cancelling import check
 from .correction import Correction
 from .heading import yaws_of_votes
@@ -330,12 +332,18 @@ class Follower:
         w, end = windows, windows.first[SHIFT]
         robot = w.corrected(w.progress[:end], w.robot[:end], tail.nodes)
         leaving = at_poses(w.readings.select(slice(0, end)), compose(robot, w.mount[:end]))
-        self._past = _concatenated(self._past, leaving)
+        self._past = self._bounded(_concatenated(self._past, leaving))
         odometry = _from_step(tail.odometry, SHIFT)
         self._settled = self._followed.until(max(int(odometry.stamp[0]), self._settled.end))
+        self._settled = self._settled.bounded(MOST_POSES)
         places = _edges_from(tail.places, relative(tail.nodes[SHIFT], tail.nodes[0]), SHIFT)
         stay = w.readings.select(slice(end, None))
         return _tail(odometry, stay, tail.nodes[SHIFT:], SETTLED, places)
+
+    def _bounded(self, past: Readings) -> Readings:
+        """Return readings thinned to `max_readings`; not at each step, since thinning once for many costs the same."""
+        bound = self._parameters.association.max_readings
+        return past if not bound or len(past) <= bound + bound // 8 else past.select(kept(past, bound))
 
 
 def direction_of_walls(windows: Windows, nodes: Floats) -> float:

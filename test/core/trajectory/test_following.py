@@ -68,6 +68,21 @@ def followed(sample: Sample) -> Follower:
     return follower
 
 
+def test_memory_of_following_is_bounded(sample: Sample, followed: Follower, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A robot that follows one run for days keeps no more readings and poses than other parts of the node."""
+    readings, poses = 250, len(sample.correction.odometry.stamp)
+    assert len(followed._past) > readings + readings // 8
+    assert len(followed.correction.odometry.stamp) > poses + 1000
+    monkeypatch.setattr(following, 'MOST_POSES', poses)
+    follower = Follower(sample.correction, {}, Parameters().varied({'max_readings': readings}))
+    follower.follow(sample.readings, sample.odometry)
+    assert 0 < len(follower._past) <= readings + readings // 8
+    assert len(follower._settled.odometry.stamp) <= poses
+    assert follower.correction.end == followed.correction.end
+    path = follower.correction.trajectory
+    assert np.hypot(*(path.pose - sample.true.at(path.stamp))[:, :2].T).max() < 0.3
+
+
 def test_without_right_angles_walls_are_not_used(sample: Sample, monkeypatch: pytest.MonkeyPatch) -> None:
     follower = Follower(sample.correction, {}, Parameters(), right_angles=False)
     graphs = []
