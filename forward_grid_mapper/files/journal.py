@@ -110,7 +110,7 @@ class Journal:
     noticed : float
         Its time, by `time.monotonic`.
     lost : int
-        Number of readings that will never be in the journal.
+        Number of readings of the drive that will never be in the journal.
     parameters : dict
         Parameters of the node that are not the defaults, to be stored in the file.
     """
@@ -230,13 +230,16 @@ class Journal:
             self._queue(rows, count, sum(len(values[-1]) for _, values in rows))
 
     def begin_drive(self) -> None:
-        """Continue in a new file; the old one is kept. Nothing happens if nothing was written yet."""
+        """Continue in a new file; the old one is kept, or the current one continues if nothing was written yet."""
+        self.lost = 0
         if any(self._stated) or self._next:
             self._begin()
 
     def renew(self, readings: Readings, frames: tuple[str, str], path: Iterable[tuple[float, float]]) -> None:
         """Continue in a new file, which begins with all readings in memory, since the current one is `gone`."""
         self._begin()
+        # also those that could not be written before
+        self.lost = 0
         head = self._head(readings, frames)
         points = list(path)
         self._next, self._next_points = len(readings), len(points)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from typing import Any
 
@@ -14,7 +15,7 @@ from ..core.common.words import counted
 from ..core.messages.message_types import Pose2
 from ..core.trajectory.correction import Correction
 from ..core.trajectory.following import Follower
-from ..core.trajectory.windows import Odometry
+from ..core.trajectory.windows import STILL, Odometry
 from .background import Inbox, Worker
 
 
@@ -60,7 +61,7 @@ class Following:
             int64, shape (M,), and poses, float64, shape (M, 3).
         """
         follower = self.follower
-        if follower is None or self._busy or follower.obstacle or at == self._seen:
+        if follower is None or self._busy or follower.obstacle or not self._moved(at):
             return
         readings, odometry = drive()
         self._busy, self._seen = True, at
@@ -98,6 +99,12 @@ class Following:
         if follower.kept:
             said += '; the last correction is kept, since it predicts the readings better'
         return {'followed since the latest run': f'{said}; ended: {follower.obstacle}' if follower.obstacle else said}
+
+    def _moved(self, at: Pose2) -> bool:
+        """Return whether the robot has moved; odometry of a robot that stands may still be noisy."""
+        seen = self._seen
+        turn = 0.0 if seen is None else math.remainder(at.yaw - seen.yaw, math.tau)
+        return seen is None or math.dist(at[:2], seen[:2]) >= STILL or abs(turn) >= STILL
 
     def _take(self, follower: Follower) -> None:
         if follower is self.follower:

@@ -9,7 +9,9 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from typing import Any
+from typing import Any, NamedTuple
+
+from ..core.messages.message_types import NANOSECONDS
 
 MOST_STREAMS = 256
 """Most publishers, or sensors, of a topic that are distinguished."""
@@ -21,7 +23,23 @@ LASTING = 10.0
 """Seconds for which the node warns of a loss."""
 
 STEADY = 8
-"""Intervals of similar length after which the rate of a sensor is steady."""
+"""Intervals of similar length after which the rate of a sensor is steady; so many longer ones are another rate."""
+
+SWITCHED_OFF = 60 * NANOSECONDS
+"""Nanoseconds without a stamp from which a sensor was rather switched off than its messages lost."""
+
+
+class _Stream(NamedTuple):
+    """The stamps of a sensor: the last one, the usual interval, and how many intervals were like that.
+
+    `gap` is the last interval, if that was longer than usual, and `again` how many in succession were like it.
+    """
+
+    last: int
+    interval: float = 0.0
+    steady: int = 0
+    gap: int = 0
+    again: int = 0
 
 
 class Losses:
@@ -44,7 +62,7 @@ class Losses:
     def begin_anew(self) -> None:
         """Forget the last numbers and stamps, since the node was not subscribed for a while."""
         self._newest: list[int] = []
-        self._stamps: dict[str, tuple[int, float, int]] = {}
+        self._stamps: dict[str, _Stream] = {}
 
     def clear(self) -> None:
         """Set the counts to 0."""
@@ -84,15 +102,18 @@ class Losses:
 
     def _by_stamp(self, frame: str, stamp: int) -> int:
         """Return the number of missing messages: usual intervals since the sensor's last message, minus one."""
-        last, interval, steady = self._stamps.get(frame, (stamp, 0.0, 0))
+        last, interval, steady, gap, again = self._stamps.get(frame, _Stream(stamp))
         if len(self._stamps) >= MOST_STREAMS and frame not in self._stamps:
             return 0
         step, missing = stamp - last, 0
+        again = again + 1 if 0.7 * gap < step < 1.3 * gap else 1
+        gap = 0
         if interval and 0.7 * interval < step < 1.3 * interval:
             interval, steady = interval + 0.1 * (step - interval), steady + 1
-        elif interval and steady >= STEADY and step >= 1.7 * interval:
-            missing = round(step / interval) - 1
-        elif step > 0:
-            interval, steady = float(step), 0
-        self._stamps[frame] = stamp, interval, steady
+        elif interval and steady >= STEADY and 1.7 * interval <= step < SWITCHED_OFF and again < STEADY:
+            missing, gap = round(step / interval) - 1, step
+        elif 0 < step < SWITCHED_OFF:
+            # after many equal gaps, the sensor has another rate
+            interval, steady = float(step), again if again >= STEADY else 0
+        self._stamps[frame] = _Stream(stamp, interval, steady, gap, again)
         return missing

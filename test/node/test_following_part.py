@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import threading
 from typing import Any
 
@@ -86,6 +87,20 @@ def test_readings_are_followed_when_the_robot_has_moved(driving: Driving) -> Non
     follower.kept = True
     assert 'the last correction is kept' in driving.part.values()['followed since the latest run']
     assert driving.node.warned == []
+
+
+def test_noise_of_a_robot_that_stands_is_not_followed(driving: Driving) -> None:
+    """Otherwise each pose of a robot at its dock would make the thread look at the drive again."""
+    follower, rng = driving.begin(PlainFollower()), np.random.default_rng(0)
+    for noise in rng.normal(0.0, 1e-4, (20, 3)):
+        driving.offer(Pose2(*noise.tolist()))
+        driving.settle()
+    assert follower.windows == 1
+    # a turn counts as well, by the shorter way
+    for yaw, count in ((0.02, 2), (math.tau + 0.02, 2), (math.tau - 0.02, 3)):
+        driving.offer(Pose2(0.0, 0.0, yaw))
+        driving.settle()
+        assert follower.windows == count
 
 
 def test_one_piece_of_work_at_a_time(driving: Driving) -> None:

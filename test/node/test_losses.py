@@ -7,6 +7,7 @@ import time
 
 import pytest
 
+from forward_grid_mapper.core.messages.message_types import NANOSECONDS
 from forward_grid_mapper.node.losses import LASTING, MOST_STREAMS, NEW_PUBLISHER_GAP, STEADY, Losses
 
 MILLISECOND = 1_000_000
@@ -120,6 +121,47 @@ def test_irregular_interval_makes_a_sensor_irregular(odd: float) -> None:
     # from now on the irregular interval is the usual one, and the next ones are no gaps
     found = at_steps(Losses(lambda: 1), *[1.0] * 20, odd, 3.0, *[1.0] * STEADY, 3.0)
     assert found[-1] == 0
+
+
+def begun() -> tuple[Losses, int]:
+    """Losses of a sensor with ten messages a second, and its last stamp."""
+    losses, stamp = Losses(lambda: 1), 10**9
+    for _ in range(30):
+        stamp += 100 * MILLISECOND
+        losses.taken({}, 'sonar', stamp)
+    return losses, stamp
+
+
+@pytest.mark.parametrize('slower', [2.0, 2.5, 10.0])
+def test_slower_sensor_has_no_lasting_losses(slower: float) -> None:
+    """As odometry or sonars of a robot that saves power at its dock."""
+    losses, found = begun()
+    counts = []
+    for factor in (1.0, slower, 1.0, slower):
+        before = losses.lost
+        for _ in range(500):
+            found += round(factor * 100 * MILLISECOND)
+            losses.taken({}, 'sonar', found)
+        counts.append(losses.lost - before)
+    assert counts[0] == counts[2] == 0
+    assert max(counts) <= slower * STEADY
+    # at the other rate, losses are found as before
+    before = losses.lost
+    losses.taken({}, 'sonar', found + round(3 * slower * 100 * MILLISECOND))
+    assert losses.lost == before + 2
+
+
+def test_sensor_that_was_switched_off_has_lost_nothing() -> None:
+    losses, stamp = begun()
+    for pause in (3600, 100_000):
+        stamp += pause * NANOSECONDS
+        losses.taken({}, 'sonar', stamp)
+        for _ in range(20):
+            stamp += 100 * MILLISECOND
+            losses.taken({}, 'sonar', stamp)
+    assert losses.lost == 0
+    losses.taken({}, 'sonar', stamp + 300 * MILLISECOND)
+    assert losses.lost == 2, 'its rate is still known'
 
 
 def test_stamp_that_does_not_advance_is_ignored() -> None:

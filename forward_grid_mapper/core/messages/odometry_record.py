@@ -79,8 +79,11 @@ class OdometryRecord:
         """Add a pose, in any order of stamps; it replaces one of the same stamp."""
         size = self._size
         if size and stamp <= self._stamp[size - 1]:
-            self._late[stamp] = pose
             self.late += 1
+            if self._is_newest(stamp, pose):
+                # a message that is sent again changes nothing, and need not be sorted in
+                return
+            self._late[stamp] = pose
             if len(self._late) >= MOST_LATE:
                 self._sort_in()
             return
@@ -94,6 +97,12 @@ class OdometryRecord:
         self._size = size + 1
         if self._most and self._size > self._most:
             self._thin()
+
+    def _is_newest(self, stamp: int, pose: Pose2) -> bool:
+        """Return whether this is the newest pose, at its stamp."""
+        newest = self._size - 1
+        equal = stamp == self._stamp[newest] and list(pose) == self._pose[newest].tolist()
+        return bool(equal and stamp not in self._late)
 
     def drop(self, stamp: int) -> None:
         """Remove the pose of the last stamp; snapshots keep it."""
@@ -152,13 +161,17 @@ class OdometryRecord:
         """Sort in late poses; into copies, since snapshots share the columns."""
         if not self._late:
             return
-        stamp = np.concatenate([self._stamp[: self._size], np.array(list(self._late), np.int64)])
-        pose = np.concatenate([self._pose[: self._size], np.array(list(self._late.values()))])
+        size = self._size
+        # usually only the last ones are out of order, of a drive of hours
+        begin = int(np.searchsorted(self._stamp[:size], min(self._late)))
+        stamp = np.concatenate([self._stamp[begin:size], np.array(list(self._late), np.int64)])
+        pose = np.concatenate([self._pose[begin:size], np.array(list(self._late.values()))])
         self._late.clear()
         order = np.argsort(stamp, kind='stable')
         # of equal stamps, keep the one that came last
-        last = np.append(np.diff(stamp[order]) > 0, True)
-        self._stamp, self._pose = stamp[order[last]], pose[order[last]]
+        order = order[np.append(np.diff(stamp[order]) > 0, True)]
+        self._stamp = np.concatenate([self._stamp[:begin], stamp[order]])
+        self._pose = np.concatenate([self._pose[:begin], pose[order]])
         self._size = len(self._stamp)
         if self._most and self._size > self._most:
             self._thin()
@@ -168,13 +181,13 @@ class OdometryRecord:
         begin = self._next if self._next < self._size - 2 else 0
         end = min(begin + PART, self._size)
         stay = np.ones(self._size, np.bool_)
-        stay[begin:end] = _hard_to_interpolate(self._stamp[begin:end], self._pose[begin:end])
+        stay[begin:end] = hard_to_interpolate(self._stamp[begin:end], self._pose[begin:end])
         self._next = begin + int(np.count_nonzero(stay[begin:end]))
         self._stamp, self._pose = self._stamp[: self._size][stay], self._pose[: self._size][stay]
         self._size = len(self._stamp)
 
 
-def _hard_to_interpolate(stamp: NDArray[np.int64], pose: Floats) -> NDArray[np.bool_]:
+def hard_to_interpolate(stamp: NDArray[np.int64], pose: Floats) -> NDArray[np.bool_]:
     """Return a mask of the poses that are kept, shape (M,).
 
     Of every second pose, those with the smallest error of interpolation between their neighbours are dropped: at least

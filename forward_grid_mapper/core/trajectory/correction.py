@@ -14,6 +14,7 @@ from functools import cached_property
 import numpy as np
 
 from ..common.readings import Readings
+from ..messages.odometry_record import hard_to_interpolate
 from .local_map import at_poses
 from .outcome import replaced
 from .poses import Floats, compose, inverse, relative
@@ -56,6 +57,14 @@ class Correction:
         """
         after = int(np.searchsorted(odometry.stamp, self.end, side='right'))
         return Correction(_joined(self.odometry, odometry, after), _joined(self.trajectory, trajectory, after))
+
+    def bounded(self, most: int) -> Correction:
+        """Return a correction of at most so many poses: those are dropped that interpolation replaces best."""
+        odometry, path = self.odometry, self.trajectory
+        while len(odometry.stamp) > most:
+            stay = hard_to_interpolate(path.stamp, path.pose)
+            odometry, path = (Odometry(one.stamp[stay], one.pose[stay]) for one in (odometry, path))
+        return self if odometry is self.odometry else Correction(odometry, path)
 
     def until(self, stamp: int) -> Correction:
         """Return the correction that ends at a stamp, nanoseconds; it keeps at least one pose."""

@@ -3,7 +3,7 @@
 The last windows make a small pose graph, the *tail*. Its first nodes are fixed (*settled*). The others are determined
 by calibrated odometry, yaws and distances of walls, and loop closures with what was mapped before. So a window takes
 the same time however long the drive is. Only the path, which is copied with each window, and the readings for loop
-closures grow with the drive.
+closures grow with the drive, up to the bounds of odometry (`MOST_POSES`) and of readings (`max_readings`).
 
 The result is checked. Every few windows, the readings of a block are predicted before they are used, with the followed
 correction and with the last proven one. If the followed correction predicts clearly better, it becomes the proven one.
@@ -23,6 +23,8 @@ from numpy.typing import NDArray
 from ..common.parameters import Parameters
 from ..common.readings import Readings, in_canonical_order
 from ..messages.message_types import NANOSECONDS
+from ..messages.odometry_record import MOST_POSES
+from ..messages.thinning import kept
 from ..runtime.cancelling import check
 from .correction import Correction
 from .heading import yaws_of_votes
@@ -78,6 +80,9 @@ GOOD = 0.65
 JUDGED = 12
 """Most blocks of the judgement: 20 m."""
 
+ROUNDING = 1e-6
+"""Largest rounding error of a window coordinate."""
+
 
 class _Tail(NamedTuple):
     """The last windows of a drive, in a frame whose axes are parallel to the walls.
@@ -86,18 +91,25 @@ class _Tail(NamedTuple):
     ----------
     odometry : Odometry
         From the begin of the first window on.
+    readings : Readings
+        Of the complete windows, without those at standstill: there may be hours of them, and each step would sort them
+        out again.
     nodes : float64, shape (K, 3)
         Of the complete windows.
     settled : int
         Number of the first nodes that are fixed.
     places : Edges
         Loop closures, as edges from the first node.
+    u : float
+        Window coordinate (module `windows`) at the end of odometry.
     """
 
     odometry: Odometry
+    readings: Readings
     nodes: Floats
     settled: int
     places: Edges
+    u: float
 
 
 class Follower:
@@ -164,8 +176,8 @@ class Follower:
         Parameters
         ----------
         readings : Readings
-            Of the drive so far, placed by odometry. After the first call, those since the call before and those of the
-            last windows are enough.
+            Of the drive so far, placed by odometry. After the first call, those since the last complete window are
+            enough.
         odometry : Odometry
             Of the same time.
 
@@ -180,6 +192,8 @@ class Follower:
         tail = self._tail
         while tail is not None and not self.obstacle:
             check(self._stop)
+            if not _moves_on(tail, odometry):
+                break
             whole = _continued(tail.odometry, odometry)
             u = _window_coordinate(whole)
             end = int(np.searchsorted(u, len(tail.nodes) + 1))
@@ -215,12 +229,13 @@ class Follower:
             self._past = _concatenated(at_poses(before, relative(self._axes, sensors)), self._past)
         nodes = relative(self._axes, nodes[begin:])
         nodes[:, 2] = np.unwrap(nodes[:, 2])
-        return _Tail(_from_step(odometry, begin), nodes, len(nodes), no_edges())
+        rest = windows.readings.select(slice(windows.first[begin], None))
+        return _tail(_from_step(odometry, begin), rest, nodes, len(nodes), no_edges())
 
     def _step(self, tail: _Tail, readings: Readings, odometry: Odometry) -> _Tail:
         """Return the tail extended by the rest of `odometry`, whose last window has just become complete."""
-        within = (readings.stamp > odometry.stamp[0]) & (readings.stamp <= odometry.stamp[-1])
-        windows = cut(in_canonical_order(readings.select(within)), odometry)
+        new = (readings.stamp > tail.odometry.stamp[-1]) & (readings.stamp <= odometry.stamp[-1])
+        windows = cut(_concatenated(tail.readings, in_canonical_order(readings.select(new))), odometry)
         count, none = len(windows), np.zeros(len(windows), np.bool_)
         motion = motions(calibrated(odometry, self._calibration), windows)
         nodes, places = _extrapolated(tail.nodes, motion), tail.places
@@ -233,7 +248,7 @@ class Follower:
                 self._judge(scans, _extrapolated(tail.nodes[: block[0]], motion), block)
         solution = solve(self._graph(windows, motion, nodes, tail._replace(places=places)), nodes, np.zeros(0))
         self.windows += count - len(tail.nodes)
-        tail = _Tail(odometry, solution.nodes, tail.settled, places)
+        tail = _tail(odometry, windows.readings, solution.nodes, tail.settled, places)
         self._put_in_force(tail, windows)
         return self._shifted(tail, windows) if count >= LONGEST else tail
 
@@ -317,11 +332,18 @@ class Follower:
         w, end = windows, windows.first[SHIFT]
         robot = w.corrected(w.progress[:end], w.robot[:end], tail.nodes)
         leaving = at_poses(w.readings.select(slice(0, end)), compose(robot, w.mount[:end]))
-        self._past = _concatenated(self._past, leaving)
+        self._past = self._bounded(_concatenated(self._past, leaving))
         odometry = _from_step(tail.odometry, SHIFT)
         self._settled = self._followed.until(max(int(odometry.stamp[0]), self._settled.end))
+        self._settled = self._settled.bounded(MOST_POSES)
         places = _edges_from(tail.places, relative(tail.nodes[SHIFT], tail.nodes[0]), SHIFT)
-        return _Tail(odometry, tail.nodes[SHIFT:], SETTLED, places)
+        stay = w.readings.select(slice(end, None))
+        return _tail(odometry, stay, tail.nodes[SHIFT:], SETTLED, places)
+
+    def _bounded(self, past: Readings) -> Readings:
+        """Return readings thinned to `max_readings`; not at each step, since thinning once for many costs the same."""
+        bound = self._parameters.association.max_readings
+        return past if not bound or len(past) <= bound + bound // 8 else past.select(kept(past, bound))
 
 
 def direction_of_walls(windows: Windows, nodes: Floats) -> float:
@@ -358,6 +380,20 @@ def _from_step(odometry: Odometry, begin: int) -> Odometry:
     stamp = odometry.stamp[first - 1] + round(part * (odometry.stamp[first] - odometry.stamp[first - 1]))
     pose = interpolated(np.array([begin]), u[first - 1 : first + 1], odometry.pose[first - 1 : first + 1])
     return Odometry(np.append(stamp, odometry.stamp[first:]), np.concatenate([pose, odometry.pose[first:]]))
+
+
+def _tail(odometry: Odometry, readings: Readings, nodes: Floats, settled: int, places: Edges) -> _Tail:
+    return _Tail(odometry, readings, nodes, settled, places, float(_window_coordinate(odometry)[-1]))
+
+
+def _moves_on(tail: _Tail, odometry: Odometry) -> bool:
+    """Return whether the odometry after the tail may complete a window.
+
+    Only the poses after the tail are looked at, since most calls complete none, and the tail may contain hours at
+    standstill.
+    """
+    new = _continued(Odometry(tail.odometry.stamp[-1:], tail.odometry.pose[-1:]), odometry)
+    return tail.u + float(_window_coordinate(new)[-1]) > len(tail.nodes) + 1 - ROUNDING
 
 
 def _continued(tail: Odometry, odometry: Odometry) -> Odometry:

@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..common.readings import Readings
+from ..runtime.jit import kernel
 from .poses import Floats, compose, interpolated, relative
 
 TRAVEL = 0.4
@@ -155,16 +156,31 @@ def corrected(progress: Floats, odometry: Floats, at: Floats, node: Floats, node
 def _still(odometry: Floats, sensor: NDArray[np.int32]) -> NDArray[np.bool_]:
     """Return which readings were taken when the robot had not moved since an earlier one of the sensor, shape (N,)."""
     out = np.zeros(len(sensor), np.bool_)
-    for number in np.unique(sensor):
-        mine = np.flatnonzero(sensor == number)
-        last = odometry[mine[0]]
-        for t in mine[1:]:
-            pose = odometry[t]
-            if math.hypot(pose[0] - last[0], pose[1] - last[1]) < STILL and abs(pose[2] - last[2]) < STILL:
-                out[t] = True
-            else:
-                last = pose
+    mark_still(odometry, sensor, np.full(int(sensor.max(initial=0)) + 1, -1, np.int64), out)
     return out
+
+
+@kernel
+def mark_still(odometry: Floats, sensor: NDArray[np.int32], last: NDArray[np.int64], out: NDArray[np.bool_]) -> None:
+    """Set `out` to True for the readings of `_still`; a drive may contain hours of them.
+
+    Parameters
+    ----------
+    odometry : float64, shape (N, 3)
+    sensor : int32, shape (N,)
+    last : int64, shape (S,)
+        −1; becomes the last reading of each sensor that is not marked.
+    out : bool, shape (N,)
+    """
+    for t in range(len(sensor)):
+        s = sensor[t]
+        k = last[s]
+        if k >= 0:
+            far = math.hypot(odometry[t, 0] - odometry[k, 0], odometry[t, 1] - odometry[k, 1])
+            if far < STILL and abs(odometry[t, 2] - odometry[k, 2]) < STILL:
+                out[t] = True
+                continue
+        last[s] = t
 
 
 def cut(readings: Readings, odometry: Odometry) -> Windows:

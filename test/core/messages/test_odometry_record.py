@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import random
+from typing import Any
 
 import numpy as np
 import pytest
@@ -38,6 +39,50 @@ def test_poses_in_any_order_are_sorted_by_stamp() -> None:
         for now_stamp, now_pose, then_stamp, then_pose in snapshots:
             assert np.array_equal(now_stamp, then_stamp)
             assert np.array_equal(now_pose, then_pose)
+
+
+def hours_of_odometry(count: int = 200_000) -> OdometryRecord:
+    record = OdometryRecord(0)
+    record.extend([20 * k for k in range(count)], [Pose2(0.01 * k, 0.0, 0.0) for k in range(count)])
+    return record
+
+
+def test_message_that_is_sent_again_changes_nothing() -> None:
+    """As by a driver that publishes at a higher rate than it measures."""
+    record = hours_of_odometry()
+    stamp, pose = record.snapshot()
+    newest = record.newest
+    assert newest is not None
+    record.add(*newest)
+    assert record.late == 1
+    again, _ = record.snapshot()
+    assert np.shares_memory(again, stamp), 'nothing was sorted'
+    # unless another pose came in between
+    other = Pose2(1.0, 2.0, 3.0)
+    record.add(newest[0], other)
+    record.add(*newest)
+    assert np.array_equal(record.snapshot()[1], pose)
+    record.add(newest[0], other)
+    assert record.snapshot()[1][-1].tolist() == list(other)
+
+
+def test_sorting_in_late_poses_looks_at_the_last_poses_only(monkeypatch: pytest.MonkeyPatch) -> None:
+    record = hours_of_odometry()
+    sizes: list[int] = []
+    sort = np.argsort
+
+    def counting(values: np.ndarray, **options: Any) -> Any:
+        sizes.append(len(values))
+        return sort(values, **options)
+
+    monkeypatch.setattr(np, 'argsort', counting)
+    record.add(20 * 199_990 + 10, Pose2(0.0, 1.0, 0.0))
+    stamp, pose = record.snapshot()
+    assert len(stamp) == 200_001
+    assert (np.diff(stamp) > 0).all()
+    assert pose[199_991].tolist() == [0.0, 1.0, 0.0]
+    assert sizes
+    assert max(sizes) < 20
 
 
 def test_memory_is_bounded_and_the_path_stays_accurate() -> None:

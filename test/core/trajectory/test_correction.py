@@ -110,3 +110,17 @@ def test_correction_is_extended_and_cut_off(seed: int) -> None:
     assert np.array_equal(back.trajectory.pose, first.trajectory.pose)
     assert back.last == pytest.approx(first.last)
     assert len(longer.until(0).trajectory.stamp) == 1
+
+
+def test_bounded_correction_drops_poses_that_interpolation_replaces() -> None:
+    # along a straight line, most poses are not needed
+    straight = np.stack([np.linspace(0.0, 4.0, 400), np.zeros(400), np.zeros(400)], 1)
+    odometry = Odometry(10**8 * np.arange(400), straight)
+    correction = Correction(odometry, Odometry(odometry.stamp, compose(np.array([1.0, 2.0, 0.5]), straight)))
+    assert correction.bounded(400) is correction
+    fewer = correction.bounded(100)
+    assert 10 < len(fewer.odometry.stamp) <= 100
+    assert np.array_equal(fewer.odometry.stamp, fewer.trajectory.stamp)
+    assert fewer.odometry.stamp[[0, -1]].tolist() == odometry.stamp[[0, -1]].tolist()
+    assert fewer.trajectory.at(odometry.stamp) == pytest.approx(correction.trajectory.pose)
+    assert fewer.last == pytest.approx(correction.last)

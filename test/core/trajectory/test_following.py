@@ -13,7 +13,7 @@ from forward_grid_mapper.core import warm_up
 from forward_grid_mapper.core.common.errors import Cancelled
 from forward_grid_mapper.core.common.parameters import Parameters
 from forward_grid_mapper.core.common.readings import Readings
-from forward_grid_mapper.core.trajectory import following, likelihood, walls
+from forward_grid_mapper.core.trajectory import following, likelihood, walls, windows
 from forward_grid_mapper.core.trajectory.correction import Correction
 from forward_grid_mapper.core.trajectory.following import LATE, LONGEST, SETTLED, Follower, direction_of_walls
 from forward_grid_mapper.core.trajectory.pose_graph import Edges, no_edges
@@ -66,6 +66,21 @@ def followed(sample: Sample) -> Follower:
     follower = follower_of(sample)
     assert follower.follow(sample.readings, sample.odometry)
     return follower
+
+
+def test_memory_of_following_is_bounded(sample: Sample, followed: Follower, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A robot that follows one run for days keeps no more readings and poses than other parts of the node."""
+    readings, poses = 250, len(sample.correction.odometry.stamp)
+    assert len(followed._past) > readings + readings // 8
+    assert len(followed.correction.odometry.stamp) > poses + 1000
+    monkeypatch.setattr(following, 'MOST_POSES', poses)
+    follower = Follower(sample.correction, {}, Parameters().varied({'max_readings': readings}))
+    follower.follow(sample.readings, sample.odometry)
+    assert 0 < len(follower._past) <= readings + readings // 8
+    assert len(follower._settled.odometry.stamp) <= poses
+    assert follower.correction.end == followed.correction.end
+    path = follower.correction.trajectory
+    assert np.hypot(*(path.pose - sample.true.at(path.stamp))[:, :2].T).max() < 0.3
 
 
 def test_without_right_angles_walls_are_not_used(sample: Sample, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -151,6 +166,75 @@ def test_following_waits_for_complete_windows(sample: Sample) -> None:
     assert not follower.follow(readings, sample.odometry)
     assert follower.windows == 0
     assert follower.follow(sample.readings, sample.odometry)
+
+
+def with_stand(sample: Sample, seconds: int) -> tuple[Readings, Odometry, int]:
+    """The drive with the robot standing for a while after the known part, where it measures and sends odometry; its
+    last stamp."""
+    r, o, rate = sample.readings, sample.odometry, 20
+    begin = int(o.stamp[sample.known + 50])
+    times = begin + 10**9 // rate * np.arange(1, rate * seconds + 1)
+    end, later = int(times[-1]), o.stamp > begin
+    before, near = r.stamp <= begin, np.flatnonzero(r.stamp <= begin)[-16:]
+    still = r.select(np.tile(near, len(times)))
+    mount = relative(o.at(still.stamp), np.stack([still.x, still.y, still.yaw], 1))
+    x, y, yaw = compose(o.at(np.array([begin])), mount).T
+    still = replace(still, x=x.copy(), y=y.copy(), yaw=yaw.copy(), stamp=np.repeat(times, 16))
+    rest = r.select(~before)
+    rest = replace(rest, stamp=rest.stamp + end - begin)
+    stamp = np.concatenate([o.stamp[~later], times, o.stamp[later] + end - begin])
+    poses = [o.pose[~later], np.repeat(o.at(np.array([begin])), len(times), 0), o.pose[later]]
+    readings = following._concatenated(following._concatenated(r.select(before), still), rest)
+    return readings, Odometry(stamp, np.concatenate(poses)), end
+
+
+def test_windows_after_a_stand_take_no_longer(sample: Sample, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Readings at standstill are sorted out once, not in each of the windows that contain them."""
+    readings, odometry, end = with_stand(sample, 300)
+    sizes: list[tuple[int, int]] = []
+
+    def counting(part: Readings, path: Odometry) -> Any:
+        sizes.append((int(path.stamp[-1]), len(part)))
+        return cut(part, path)
+
+    monkeypatch.setattr(following, 'cut', counting)
+    follower = follower_of(sample)
+    follower.follow(readings, odometry)
+    after = [size for stamp, size in sizes if stamp > end]
+    assert len(after) > 20
+    assert after[0] > 90_000, 'the stand is in this window'
+    assert max(after[1:]) < 3000
+    monkeypatch.undo()
+    path = follower.correction.extended(odometry.stamp, odometry.pose)
+    late = path.stamp > end
+    off = path.pose[late, :2] - sample.true.pose[-np.count_nonzero(late) :, :2]
+    assert np.hypot(*off.T).max() < 0.3
+
+
+def test_waiting_for_a_window_looks_at_new_poses_only(sample: Sample, monkeypatch: pytest.MonkeyPatch) -> None:
+    readings, odometry, end = with_stand(sample, 300)
+    follower = follower_of(sample)
+    first = int(np.searchsorted(odometry.stamp, end + 4 * 10**9))
+    seen = readings.select(readings.stamp <= odometry.stamp[first - 1])
+    follower.follow(seen, Odometry(odometry.stamp[:first], odometry.pose[:first]))
+    assert follower.windows > 0
+    tail = follower._tail
+    assert tail is not None
+    assert len(tail.odometry.stamp) > 6000
+    sizes: list[int] = []
+    of = Odometry.of
+
+    def counting(stamp: np.ndarray, pose: np.ndarray) -> Odometry:
+        sizes.append(len(stamp))
+        return of(stamp, pose)
+
+    monkeypatch.setattr(Odometry, 'of', staticmethod(counting))
+    # the robot has not driven a whole window since
+    one = int(np.searchsorted(odometry.stamp, tail.odometry.stamp[-1])) + 2
+    follower.follow(seen, Odometry(odometry.stamp[:one], odometry.pose[:one]))
+    assert follower._tail is tail
+    assert sizes
+    assert max(sizes) < 100
 
 
 def test_calibration_corrects_odometry_without_echoes(sample: Sample, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -323,7 +407,7 @@ def test_windows_from_a_later_begin_are_the_same(sample: Sample) -> None:
 
 def test_following_compiles_no_kernels(sample: Sample) -> None:
     warm_up.warm_up_trajectory()
-    kernels = [walls.count_votes, likelihood.score_poses, likelihood._set_unknown]
+    kernels = [walls.count_votes, likelihood.score_poses, likelihood._set_unknown, windows.mark_still]
     before = [len(kernel.signatures) for kernel in kernels]
     half = int(sample.odometry.stamp[(sample.known + len(sample.odometry.stamp)) // 2])
     follower_of(sample).follow(*sample.until(half))

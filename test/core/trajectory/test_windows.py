@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from forward_grid_mapper.core.common.readings import Readings
-from forward_grid_mapper.core.trajectory.windows import Odometry, corrected, cut
+from forward_grid_mapper.core.trajectory import windows
+from forward_grid_mapper.core.trajectory.windows import STILL, Odometry, corrected, cut
 
 
 def driven(steps: list[tuple[float, float]]) -> tuple[Readings, Odometry]:
@@ -24,13 +25,13 @@ def driven(steps: list[tuple[float, float]]) -> tuple[Readings, Odometry]:
 @pytest.mark.parametrize('stop', [0, 100])
 def test_nodes_are_distinct_after_a_standstill(last: float, stop: int) -> None:
     readings, odometry = driven([(0.1, 0.02)] * 100 + [(0.1, 0.0)] * stop + [(0.1, last)])
-    windows = cut(readings, odometry)
-    assert (np.diff(windows.node_progress) > 0.0).all()
-    middle = 0.2 + 0.4 * np.arange(len(windows))
-    assert windows.node[:-3, 0] == pytest.approx(middle[:-3], abs=1e-6)
+    found = cut(readings, odometry)
+    assert (np.diff(found.node_progress) > 0.0).all()
+    middle = 0.2 + 0.4 * np.arange(len(found))
+    assert found.node[:-3, 0] == pytest.approx(middle[:-3], abs=1e-6)
     # one of them may be at the standstill
-    assert (np.abs(windows.node[-3:, 0] - middle[-3:]) > 1e-6).sum() <= (stop > 0)
-    same = corrected(odometry.progress, odometry.pose, windows.node_progress, windows.node, windows.node)
+    assert (np.abs(found.node[-3:, 0] - middle[-3:]) > 1e-6).sum() <= (stop > 0)
+    same = corrected(odometry.progress, odometry.pose, found.node_progress, found.node, found.node)
     assert same == pytest.approx(odometry.pose, abs=1e-9)
 
 
@@ -39,6 +40,24 @@ def test_nodes_of_slow_odometry_are_on_the_path() -> None:
     for _ in range(20):
         steps = [(1.0, 0.8 * float(moves)) for moves in rng.random(60) < 0.5]
         readings, odometry = driven([(1.0, 0.8), *steps, (1.0, 0.8)])
-        windows = cut(readings, odometry)
-        assert (np.diff(windows.node_progress) > 0.0).all()
-        assert windows.travel == pytest.approx(windows.node[:, 0], abs=1e-6)
+        found = cut(readings, odometry)
+        assert (np.diff(found.node_progress) > 0.0).all()
+        assert found.travel == pytest.approx(found.node[:, 0], abs=1e-6)
+
+
+@pytest.mark.parametrize('seed', range(5))
+def test_readings_at_standstill_are_those_of_a_loop_over_each_sensor(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    steps = rng.normal(0.0, 0.006, (400, 3)) * (rng.random((400, 1)) < 0.5)
+    pose, sensor = np.cumsum(steps, axis=0), rng.integers(0, 4, 400).astype(np.int32)
+    expected = np.zeros(400, np.bool_)
+    for number in range(4):
+        last = None
+        for t in np.flatnonzero(sensor == number):
+            if last is not None and np.hypot(*(pose[t] - last)[:2]) < STILL and abs(pose[t, 2] - last[2]) < STILL:
+                expected[t] = True
+            else:
+                last = pose[t]
+    assert 50 < np.count_nonzero(expected) < 350
+    assert np.array_equal(windows._still(pose, sensor), expected)
+    assert not len(windows._still(pose[:0], sensor[:0]))
