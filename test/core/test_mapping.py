@@ -12,6 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import naive
+from forward_grid_mapper.core.common.constants import FARTHEST_RANDOM
 from forward_grid_mapper.core.common.errors import Cancelled, InputError
 from forward_grid_mapper.core.common.grid import Grid
 from forward_grid_mapper.core.common.parameters import Parameters
@@ -49,6 +50,18 @@ def test_maps_do_not_depend_on_the_order_of_arrival() -> None:
     readings = some()
     shuffled = readings.select(np.random.default_rng(1).permutation(len(readings)))
     assert same(run(readings), run(shuffled))
+
+
+@pytest.mark.parametrize('z_max', [1e30, float(np.finfo(np.float32).max), 1e300])
+def test_maps_of_a_driver_that_knows_no_largest_range(z_max: float) -> None:
+    readings = some()
+    readings = readings.select(readings.echo)
+    made = [
+        run(dataclasses.replace(readings, z_max=np.full(len(readings), limit)), p_rand=1e-4, p_lost=0.0, sigma=0.01)
+        for limit in (z_max, FARTHEST_RANDOM)
+    ]
+    assert all(maps.statistics['converged'] for maps in made)
+    assert same(*made)
 
 
 def test_maps_do_not_depend_on_sensor_numbers() -> None:

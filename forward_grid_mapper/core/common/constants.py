@@ -13,6 +13,11 @@ HIT_LENGTH = 0.1
 MOST_HIT = 0.98
 """Largest probability that a cell returns the echo; freeing a cell divides by the rest."""
 
+FARTHEST_RANDOM = 1000.0
+"""Largest range of a random measurement, metres: that of the parameter `max_range`. Drivers that know no largest range
+send the largest number; a density of nearly zero would give single readings more weight than all others together, and
+likelihood ratios that no float32 can represent."""
+
 # Normals of surfaces
 
 NEIGHBOURHOOD = 0.3

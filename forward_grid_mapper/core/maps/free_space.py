@@ -25,7 +25,7 @@ from ..evidence.state import State
 from ..runtime.jit import allocating_kernel, inlined_kernel
 from ..sensor.cone import rows_of, runs_of, strength
 from ..sensor.cone_table import cone_of
-from ..sensor.density import density
+from ..sensor.density import density, random_density
 
 DIRECTIONS = 4
 """Directions, 45° apart: along the rows, the columns and both diagonals; opposite directions are the same. With eight,
@@ -113,8 +113,8 @@ def add_passes(s: State, begin: int, end: int, random: Floats, lost: Floats, occ
     """Add the probabilities that the readings `begin` to `end` passed the cells of their cones to `passed`.
 
     `passed` is int64, in units of UNIT, shape (DIRECTIONS, cells). All cells of a cone are included, also those beyond
-    the limit of the incidence angle. `random` and `lost` are the densities p_rand / z_max and p_lost · N(z; z_max, σ)
-    of all readings, 1/m.
+    the limit of the incidence angle. `random` and `lost` are the densities of `random_density` and p_lost · N(z; z_max,
+    σ) of all readings, 1/m.
     """
     # the band of a cone has no more cells than the largest cone
     squares, remaining = s.workspace.key, np.empty(len(s.workspace.key) + 1)
@@ -188,7 +188,7 @@ def count_passes(passed: Any, noticed: Any, p_hit: float, whole: Any, out: Any) 
 def passes_by_direction(evidence: Evidence, occupied: NDArray[np.uint8]) -> NDArray[np.int64]:
     """Return the expected number of passes by direction and cell, in units of UNIT, shape (DIRECTIONS, cells)."""
     model = evidence.model
-    random = model.p_rand / evidence.z_max
+    random = random_density(model, evidence.z_max)
     # also for echoes, so that one from nearly z_max frees little more than a reading without echo
     lost = model.p_lost * evidence.state.reading_states['max_range'][: len(evidence)]
     passed = np.zeros((DIRECTIONS, evidence.grid.size), np.int64)

@@ -11,6 +11,7 @@ from __future__ import annotations
 import math
 from typing import NamedTuple
 
+from ..common.constants import FARTHEST_RANDOM
 from ..common.parameter_groups import ModelParameters
 from .density import density, hit_probability
 
@@ -49,7 +50,7 @@ def reading_bounds(model: ModelParameters, resolution: float, z_max: float) -> R
     gamma, p_hit = model.likelihood_exponent, hit_probability(model, resolution)
     peak = density(0.0, max(model.sigma, resolution / 2))
     explained = (1.0 - model.p_rand - model.p_lost) * peak
-    random = model.p_rand / z_max
+    random = model.p_rand / min(z_max, FARTHEST_RANDOM)
     silent = random + model.p_lost * peak
 
     def against(floor: float, left: float) -> float:

@@ -7,7 +7,7 @@
 
 p_hit is that of a cell (`hit_probability`), d_k the distance of the k-th nearest occupied cell of the cone. These are
 (22), (24) and (25) of the paper with the prior of the correspondences, (28), summed over them. With p_lost = 0 and
-cells of 0.1 m it is the model of the paper.
+cells of 0.1 m it is the model of the paper. (*) is p_rand / `FARTHEST_RANDOM` if z_max is larger.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ..common.constants import HIT_LENGTH, MOST_HIT
+from ..common.constants import FARTHEST_RANDOM, HIT_LENGTH, MOST_HIT
 from ..common.parameter_groups import ModelParameters
 from ..common.readings import Floats, Readings
 from ..runtime.jit import allocating_kernel, inlined_kernel
@@ -38,7 +38,7 @@ class Causes(NamedTuple):
     p_hit, mixture_weight : float
         p_hit of a cell, and 1 − p_rand − p_lost, the weight of the causes that depend on the map.
     random, lost : float64, shape (N,)
-        The densities p_rand / z_max and, without echo, p_lost · N(z; z_max, σ), 1/m.
+        The densities of `random_density` and, without echo, p_lost · N(z; z_max, σ), 1/m.
     max_range : float64, shape (N,)
         N(z; z_max, σ), 1/m.
     """
@@ -92,6 +92,12 @@ def hit_parameter(probability: float, resolution: float) -> float:
     return float(1.0 - (1.0 - min(probability, MOST_HIT)) ** (HIT_LENGTH / resolution))
 
 
+def random_density(model: ModelParameters, z_max: Floats) -> Floats:
+    """Return the density of a random measurement, p_rand / z_max, 1/m, for largest ranges in metres."""
+    out: Floats = model.p_rand / np.minimum(z_max, FARTHEST_RANDOM)
+    return out
+
+
 def causes_of(readings: Readings, sigma: Floats, model: ModelParameters, resolution: float) -> Causes:
     """Return the terms of each reading that do not depend on the map.
 
@@ -107,4 +113,4 @@ def causes_of(readings: Readings, sigma: Floats, model: ModelParameters, resolut
     max_range: Floats = _densities((readings.z_max - readings.z) / sigma, np.ascontiguousarray(sigma))
     lost = np.where(readings.echo, 0.0, model.p_lost * max_range)
     p_hit, weight = hit_probability(model, resolution), 1.0 - model.p_rand - model.p_lost
-    return Causes(p_hit, weight, model.p_rand / readings.z_max, lost, max_range)
+    return Causes(p_hit, weight, random_density(model, readings.z_max), lost, max_range)
