@@ -20,7 +20,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from .common.constants import FORBIDDEN
+from .common.constants import FARTHEST_RANDOM, FORBIDDEN
 from .common.grid import Grid, Window, part_of, united
 from .common.parameters import Parameters
 from .common.readings import Readings, of_drives
@@ -33,7 +33,7 @@ from .runtime.threads import cores
 from .search.flips import flip_in_order, promising
 from .search.prior import wall_prior
 from .search.search import LEAST, Search
-from .sensor.cone_table import effective_sigma, grid_of
+from .sensor.cone_table import effective_sigma, grid_of, reach_of
 
 SAME_PLACE = 0.5
 """Poses of equal readings differ by less than so many cells, and this fraction of the half angle."""
@@ -179,7 +179,7 @@ class OnlineMap:
             return
         grid = map_grid(readings, self._parameters, within=self.grid)
         evidence = self._with_room(grid)
-        window = self._around(evidence.grid, readings)
+        window = self._around(evidence, readings)
         traversed = self._newly_traversed(readings, evidence.grid)
         before = len(evidence)
         self._insert(evidence, readings)
@@ -323,12 +323,17 @@ class OnlineMap:
         self._evidence, self._traversed, self._prior = evidence, traversed, prior
         return evidence
 
-    def _around(self, grid: Grid, readings: Readings) -> Window:
+    def _around(self, evidence: Evidence, readings: Readings) -> Window:
         """Return the window of all cells that flips near new readings may change."""
-        p = self._parameters
+        p, grid = self._parameters, evidence.grid
         box = grid_of(readings, p.model, p.grid)
         # flips affect the readings that observe a cell, and these reach that far
-        around = math.ceil(float(readings.z_max.max()) / grid.resolution)
+        farthest = float(readings.z_max.max())
+        if farthest > FARTHEST_RANDOM:
+            # the driver knows no largest range; without this, each sweep would examine the whole map
+            new = reach_of(readings, effective_sigma(readings, p.model, grid.resolution)).max()
+            farthest = max(float(new), float(evidence.cones['reach'].max(initial=0.0)) * grid.resolution)
+        around = math.ceil(farthest / grid.resolution)
         row, column = box.row - grid.row, box.column - grid.column
         return (
             max(row - around, 0),

@@ -265,6 +265,18 @@ def test_grid_of_a_corridor_has_margins_within_max_cells(turned: bool) -> None:
     assert bounded._evidence.grid.size <= most
 
 
+def test_sweep_of_a_driver_that_knows_no_largest_range_examines_only_its_surroundings() -> None:
+    readings = Readings.from_columns(
+        ('a',), x=[0.0, 0.0, 60.0], y=0.0, yaw=0.0, z=[1.0, 3.0, 1.0], z_max=3.4e38, half_angle=0.13, stamp=np.arange(3)
+    )
+    online = in_sweeps(readings, Parameters(), 2)
+    left, right = online._around(online._evidence, readings.select(slice(2, 3)))[2:]
+    assert online._evidence.grid.width > 600
+    # it reaches 1.4 m, and the readings around as far as the longest one, 3.4 m
+    assert 68 <= right - left <= 90
+    assert consistent(online)
+
+
 def test_many_readings_at_once_are_not_stored_twice() -> None:
     online = OnlineMap(Parameters())
     online.add(some(count=3000))
