@@ -15,7 +15,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import fields
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -37,13 +37,14 @@ from .matching import grid_around, measure
 from .odometry_model import CALIBRATION, Noise, calibrated, covariances, motions
 from .passes import BEHIND, BLOCK
 from .pose_graph import Edges, Graph, Yaws, joined, no_edges, no_walls, solve
-from .poses import Floats, axes_at, compose, interpolated, relative
+from .poses import Floats, compose, relative
 from .refinement import SHORTEST
 from .scans import FEWEST_ON_MAP, Scans
 from .solving import LEAST_YAW, NOISE_FACTOR
+from .tail import Tail, continued, edges_from, from_step, window_coordinate
 from .wall_distances import Distances
 from .walls import wall_votes
-from .windows import TRAVEL, TURN, Odometry, Windows, cut
+from .windows import Odometry, Windows, cut
 
 SETTLED, LONGEST, SHIFT = 12, 44, 8
 """Windows at the begin of the tail whose nodes are fixed (5 m, from which walls continue); most windows of the tail
@@ -79,37 +80,6 @@ GOOD = 0.65
 
 JUDGED = 12
 """Most blocks of the judgement: 20 m."""
-
-ROUNDING = 1e-6
-"""Largest rounding error of a window coordinate."""
-
-
-class _Tail(NamedTuple):
-    """The last windows of a drive, in a frame whose axes are parallel to the walls.
-
-    Attributes
-    ----------
-    odometry : Odometry
-        From the begin of the first window on.
-    readings : Readings
-        Of the complete windows, without those at standstill: there may be hours of them, and each step would sort them
-        out again.
-    nodes : float64, shape (K, 3)
-        Of the complete windows.
-    settled : int
-        Number of the first nodes that are fixed.
-    places : Edges
-        Loop closures, as edges from the first node.
-    u : float
-        Window coordinate (module `windows`) at the end of odometry.
-    """
-
-    odometry: Odometry
-    readings: Readings
-    nodes: Floats
-    settled: int
-    places: Edges
-    u: float
 
 
 class Follower:
@@ -160,7 +130,7 @@ class Follower:
         self._calibration = np.array([calibration.get(name, 0.0) for name in CALIBRATION])
         known = parameters.association.odometry_noise or noise
         self._noise = Noise(yaw=max(LEAST_YAW, NOISE_FACTOR * known)) if known else Noise()
-        self._tail: _Tail | None = None
+        self._tail: Tail | None = None
         self._axes = np.zeros(3)
         self._past = Readings.from_columns(z=[], x=[], y=[], yaw=[], z_max=[], half_angle=[])
         self._gains: list[float] = []
@@ -192,10 +162,10 @@ class Follower:
         tail = self._tail
         while tail is not None and not self.obstacle:
             check(self._stop)
-            if not _moves_on(tail, odometry):
+            if not tail.moves_on(odometry):
                 break
-            whole = _continued(tail.odometry, odometry)
-            u = _window_coordinate(whole)
+            whole = continued(tail.odometry, odometry)
+            u = window_coordinate(whole)
             end = int(np.searchsorted(u, len(tail.nodes) + 1))
             if end == len(u) or whole.stamp[end] + LATE > newest:
                 break
@@ -207,7 +177,7 @@ class Follower:
             tail = self._tail = self._step(tail, readings, part)
         return self.correction is not was
 
-    def _first_tail(self, readings: Readings) -> _Tail | None:
+    def _first_tail(self, readings: Readings) -> Tail | None:
         """Return the tail at the end of the whole drive, and store the readings before it."""
         path, whole = self.correction.trajectory, self.correction.odometry
         odometry = since_jump(whole)
@@ -230,9 +200,9 @@ class Follower:
         nodes = relative(self._axes, nodes[begin:])
         nodes[:, 2] = np.unwrap(nodes[:, 2])
         rest = windows.readings.select(slice(windows.first[begin], None))
-        return _tail(_from_step(odometry, begin), rest, nodes, len(nodes), no_edges())
+        return Tail.of(from_step(odometry, begin), rest, nodes, len(nodes), no_edges())
 
-    def _step(self, tail: _Tail, readings: Readings, odometry: Odometry) -> _Tail:
+    def _step(self, tail: Tail, readings: Readings, odometry: Odometry) -> Tail:
         """Return the tail extended by the rest of `odometry`, whose last window has just become complete."""
         new = (readings.stamp > tail.odometry.stamp[-1]) & (readings.stamp <= odometry.stamp[-1])
         windows = cut(_concatenated(tail.readings, in_canonical_order(readings.select(new))), odometry)
@@ -248,11 +218,11 @@ class Follower:
                 self._judge(scans, _extrapolated(tail.nodes[: block[0]], motion), block)
         solution = solve(self._graph(windows, motion, nodes, tail._replace(places=places)), nodes, np.zeros(0))
         self.windows += count - len(tail.nodes)
-        tail = _tail(odometry, windows.readings, solution.nodes, tail.settled, places)
+        tail = Tail.of(odometry, windows.readings, solution.nodes, tail.settled, places)
         self._put_in_force(tail, windows)
         return self._shifted(tail, windows) if count >= LONGEST else tail
 
-    def _graph(self, windows: Windows, motion: Floats, nodes: Floats, tail: _Tail) -> Graph:
+    def _graph(self, windows: Windows, motion: Floats, nodes: Floats, tail: Tail) -> Graph:
         """Return the pose graph of the tail; `motion` is that of calibrated odometry, shape (K − 1, 3)."""
         count, none = np.arange(len(windows)), np.zeros(len(windows), np.bool_)
         information = np.asarray(np.linalg.inv(covariances(windows, self._noise)), np.float64)
@@ -314,7 +284,7 @@ class Follower:
         self._score, self._scored = self._score + block_scores[0], self._scored + count
         self._gains = [*self._gains[1 - JUDGED :], (block_scores[0] - block_scores[1]) / count]
 
-    def _put_in_force(self, tail: _Tail, windows: Windows) -> None:
+    def _put_in_force(self, tail: Tail, windows: Windows) -> None:
         """Put the correction of the tail in force, or the proven one if that predicts readings better."""
         odometry = tail.odometry
         pose = windows.corrected(odometry.progress, odometry.pose, tail.nodes)
@@ -327,18 +297,18 @@ class Follower:
         self.kept = better < (0.0 if self.kept else -MOST_WORSE)
         self.correction, self._followed = (self._proven if self.kept else now), now
 
-    def _shifted(self, tail: _Tail, windows: Windows) -> _Tail:
+    def _shifted(self, tail: Tail, windows: Windows) -> Tail:
         """Return the tail without its first windows; their readings become part of the map for loop closures."""
         w, end = windows, windows.first[SHIFT]
         robot = w.corrected(w.progress[:end], w.robot[:end], tail.nodes)
         leaving = at_poses(w.readings.select(slice(0, end)), compose(robot, w.mount[:end]))
         self._past = self._bounded(_concatenated(self._past, leaving))
-        odometry = _from_step(tail.odometry, SHIFT)
+        odometry = from_step(tail.odometry, SHIFT)
         self._settled = self._followed.until(max(int(odometry.stamp[0]), self._settled.end))
         self._settled = self._settled.bounded(MOST_POSES)
-        places = _edges_from(tail.places, relative(tail.nodes[SHIFT], tail.nodes[0]), SHIFT)
+        places = edges_from(tail.places, relative(tail.nodes[SHIFT], tail.nodes[0]), SHIFT, SHIFT + SETTLED)
         stay = w.readings.select(slice(end, None))
-        return _tail(odometry, stay, tail.nodes[SHIFT:], SETTLED, places)
+        return Tail.of(odometry, stay, tail.nodes[SHIFT:], SETTLED, places)
 
     def _bounded(self, past: Readings) -> Readings:
         """Return readings thinned to `max_readings`; not at each step, since thinning once for many costs the same."""
@@ -364,60 +334,6 @@ def _extrapolated(nodes: Floats, motion: Floats) -> Floats:
     for step in motion[len(nodes) - 1 :]:
         out.append(compose(out[-1], step))
     return np.array(out)
-
-
-def _window_coordinate(odometry: Odometry) -> Floats:
-    """Return u of each pose (module `windows`), in which each window is a step of 1."""
-    out: Floats = odometry.travel / TRAVEL + odometry.turn / TURN
-    return out
-
-
-def _from_step(odometry: Odometry, begin: int) -> Odometry:
-    """Return the odometry from u = `begin` on."""
-    u = _window_coordinate(odometry)
-    first = int(np.searchsorted(u, begin, side='right'))
-    part = (begin - u[first - 1]) / (u[first] - u[first - 1])
-    stamp = odometry.stamp[first - 1] + round(part * (odometry.stamp[first] - odometry.stamp[first - 1]))
-    pose = interpolated(np.array([begin]), u[first - 1 : first + 1], odometry.pose[first - 1 : first + 1])
-    return Odometry(np.append(stamp, odometry.stamp[first:]), np.concatenate([pose, odometry.pose[first:]]))
-
-
-def _tail(odometry: Odometry, readings: Readings, nodes: Floats, settled: int, places: Edges) -> _Tail:
-    return _Tail(odometry, readings, nodes, settled, places, float(_window_coordinate(odometry)[-1]))
-
-
-def _moves_on(tail: _Tail, odometry: Odometry) -> bool:
-    """Return whether the odometry after the tail may complete a window.
-
-    Only the poses after the tail are looked at, since most calls complete none, and the tail may contain hours at
-    standstill.
-    """
-    new = _continued(Odometry(tail.odometry.stamp[-1:], tail.odometry.pose[-1:]), odometry)
-    return tail.u + float(_window_coordinate(new)[-1]) > len(tail.nodes) + 1 - ROUNDING
-
-
-def _continued(tail: Odometry, odometry: Odometry) -> Odometry:
-    """Return the odometry of the tail, continued with the poses of `odometry` after it."""
-    first = int(np.searchsorted(odometry.stamp, tail.stamp[-1], side='right'))
-    stamp = np.concatenate([tail.stamp, odometry.stamp[first:]])
-    return Odometry.of(stamp, np.concatenate([tail.pose, odometry.pose[first:]]))
-
-
-def _edges_from(places: Edges, first: Floats, leaving: int) -> Edges:
-    """Return loop closures as edges from another first node; those of nodes that become settled are dropped.
-
-    Parameters
-    ----------
-    places : Edges
-        From the first node.
-    first : float64, shape (3,)
-        Pose of this node in the frame of the one that will be the first.
-    leaving : int
-        Number of nodes that leave the tail.
-    """
-    stay, axes = places.second >= leaving + SETTLED, axes_at(first[2])
-    information = axes @ places.information[stay] @ axes.T
-    return Edges(places.first[stay], places.second[stay] - leaving, compose(first, places.pose[stay]), information)
 
 
 def _concatenated(one: Readings, other: Readings) -> Readings:

@@ -18,6 +18,7 @@ from forward_grid_mapper.core.trajectory.correction import Correction
 from forward_grid_mapper.core.trajectory.following import LATE, LONGEST, SETTLED, Follower, direction_of_walls
 from forward_grid_mapper.core.trajectory.pose_graph import Edges, no_edges
 from forward_grid_mapper.core.trajectory.poses import axes_at, compose, relative, wrapped
+from forward_grid_mapper.core.trajectory.tail import edges_from, from_step, window_coordinate
 from forward_grid_mapper.core.trajectory.windows import Odometry, cut
 from forward_grid_mapper.simulation.drift import LEVELS, odometry_of, with_drift
 from forward_grid_mapper.simulation.drive import drive
@@ -380,7 +381,7 @@ def test_recognised_places_stay_when_the_graph_is_shifted(seed: int) -> None:
     measured = relative(old, node) + rng.normal(0.0, 0.05, 3)
     half = rng.normal(0.0, 1.0, (3, 3))
     edges = Edges(np.zeros(1, np.int64), np.array([30]), measured[None], (half @ half.T)[None])
-    moved = following._edges_from(edges, relative(new, old), 8)
+    moved = edges_from(edges, relative(new, old), 8, 8 + SETTLED)
 
     def counted(frame: np.ndarray, e: Edges) -> float:
         r = relative(frame, node) - e.pose[0]
@@ -390,14 +391,14 @@ def test_recognised_places_stay_when_the_graph_is_shifted(seed: int) -> None:
     assert counted(new, moved) == pytest.approx(counted(old, edges))
     assert (moved.first[0], moved.second[0]) == (0, 22)
     gone = edges._replace(second=np.array([8 + SETTLED - 1]))
-    assert not len(following._edges_from(gone, relative(new, old), 8).first), 'settled nodes need none'
+    assert not len(edges_from(gone, relative(new, old), 8, 8 + SETTLED).first), 'settled nodes need none'
     assert axes_at(0.0) == pytest.approx(np.eye(3))
 
 
 def test_windows_from_a_later_begin_are_the_same(sample: Sample) -> None:
     for begin in (0, 1, 7, 20):
-        rest = following._from_step(sample.odometry, begin)
-        whole, ours = following._window_coordinate(sample.odometry), following._window_coordinate(rest)
+        rest = from_step(sample.odometry, begin)
+        whole, ours = window_coordinate(sample.odometry), window_coordinate(rest)
         assert ours[-1] == pytest.approx(whole[-1] - begin)
         assert (np.diff(rest.stamp) >= 0).all()
         one = cut(sample.readings.select(sample.readings.stamp > rest.stamp[0]), rest)
