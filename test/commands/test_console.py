@@ -106,7 +106,9 @@ def test_simulated_drive_is_mapped_by_the_printed_command(tmp_path: Path) -> Non
     command = simulated.stdout.splitlines()[-1].split()
     assert command[1:3] == ['-m', 'forward_grid_mapper']
     done = shell(*command[3:], '-o', tmp_path / 'maps', '-q')
-    assert (done.returncode, done.stdout, done.stderr) == (0, f'maps are in {tmp_path / "maps"}\n', '')
+    assert (done.returncode, done.stdout) == (0, f'maps are in {tmp_path / "maps"}\n')
+    # where this test is the first one
+    assert done.stderr in ('', console.COMPILES.strip('()') + '\n')
     assert {path.name for path in (tmp_path / 'maps').iterdir()} == FILES
 
 
