@@ -66,6 +66,20 @@ def test_node_refines_soon_after_a_jump(
     assert node.em.maps is first and node.em.current is None, 'once is enough'
 
 
+def test_noise_of_odometry_at_standstill_is_no_driving(inside: Callable[..., Inside], quick: Any) -> None:
+    robot = inside(refine_poses=True, refine_every=1.0).start()
+    trajectory, noise = robot.node.trajectory, np.random.default_rng(0).normal(0.0, 0.001, 2000)
+    for k, off in enumerate(noise.tolist()):
+        robot.odometry(100.0 + 0.05 * k, off)
+        trajectory._tick()
+    assert trajectory.driven == 0.0 and np.abs(np.diff(noise)).sum() > 2.0
+    # a robot that creeps at 2 mm/s drives nevertheless
+    for k in range(5000):
+        robot.odometry(200.0 + 0.05 * k, 0.0001 * k)
+        trajectory._tick()
+    assert trajectory.driven == pytest.approx(0.5, abs=0.02)
+
+
 def test_node_does_not_refine_at_each_step(inside: Callable[..., Inside], quick: Any) -> None:
     robot = inside(refine_poses=True, refine_every=1e-9).start()
     begin(robot)
