@@ -22,7 +22,7 @@ from ..core.maps.log_odds_map import LogOddsMap
 from ..core.messages.message_types import Pose2
 from ..core.messages.pose_association import PoseAssociator
 from ..core.trajectory.correction import Correction
-from ..core.trajectory.jumps import jumps
+from ..core.trajectory.jumps import jumps, may_jump
 from ..core.trajectory.refinement import SHORTEST
 from ..core.trajectory.windows import STILL, Odometry
 from ..files.report_text import UNTESTED
@@ -296,7 +296,7 @@ class Trajectory:
 
     def _add_distance(self, before: tuple[int, Pose2], stamp: int, pose: Pose2) -> None:
         """Add the distance driven since the last check, without jumps; many messages may have arrived since."""
-        if self._add_jump(before[0]):
+        if may_jump(Odometry(*self._associator.record.since(before[0]))) and self._add_jump(before[0]):
             self._counted = pose
             return
         # odometry of a robot that stands may be noisy: it would drive 100 m in an hour at a dock

@@ -102,6 +102,13 @@ def doubtful_steps(odometry: Odometry) -> NDArray[np.int64]:
     return found[doubtful]
 
 
+def may_jump(odometry: Odometry) -> bool:
+    """Return whether a step may be a jump; it is quick, since it does not ask which steps are usual."""
+    pose = odometry.pose
+    far = np.hypot(*np.diff(pose[:, :2], axis=0).T)
+    return bool(((far > LONGEST_STEP) | _turned_too_fast(np.diff(pose[:, 2]), np.diff(odometry.stamp) * 1e-9)).any())
+
+
 def _found(odometry: Odometry) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
     """Return the indices of the poses after jumps and doubtful steps, and which of them are doubtful."""
     seconds, pose = np.diff(odometry.stamp) * 1e-9, odometry.pose
