@@ -346,16 +346,19 @@ class _FitCheck:
     def __init__(self, part: Part, parameters: Parameters, stop: NDArray[np.uint8]) -> None:
         readings, path = part.readings, part.path
         travel = np.interp(readings.stamp - path.stamp[0], path.stamp - path.stamp[0], path.travel)
-        own = readings.select(travel <= OWN_MAP)
+        own, begin = readings.select(travel <= OWN_MAP), path.pose[0]
         self._count = int(np.count_nonzero(travel <= FIRST_METRES))
-        begin = path.pose[0]
-        self._own = OnMap(own, begin, own, parameters, stop).of_each(begin, self._count)
+        # there are none if other readings of the place were kept (`max_readings`)
+        if self._count >= FEWEST_KNOWN:
+            self._own = OnMap(own, begin, own, parameters, stop).of_each(begin, self._count)
 
     def fits(self, around: OnMap, begin: Floats, least: float) -> bool:
         """Return whether the score of readings on the map is at least a fraction `least` of that on their own map.
 
         Enough of the readings must lie on the map.
         """
+        if self._count < FEWEST_KNOWN:
+            return False
         there = around.of_each(begin, self._count)
         known = np.abs(there) > SILENT
         if np.count_nonzero(known) < max(LEAST_KNOWN * len(known), FEWEST_KNOWN):
