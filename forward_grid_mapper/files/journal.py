@@ -16,14 +16,13 @@ import json
 import sqlite3
 import threading
 import time
-from collections import deque
-from collections.abc import Callable, Iterable, Iterator, Mapping
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 from ..core.common.errors import BagError, OutputError
 from ..core.common.readings import Readings
+from .journal_backlog import Backlog, Everything, Item
 from .journal_database import DRIVE, FULL, Drive, DriveWriter, FolderLock, GoneError, following, number_of
 from .journal_format import Contents, Insert, encoded, path_rows, reading_rows
 from .journal_reader import is_journal, one_line, read
@@ -33,11 +32,12 @@ from .syncing import Syncer
 MOST_PENDING = 32 << 20
 """Most bytes that wait for a full or slow disk; half a million readings. Later readings are not in the journal."""
 
-BATCH = 4 << 20
-"""Bytes of one commit, so that as many rows as fit are written to a nearly full disk."""
-
 RETRY = 1.0
 """Seconds between attempts to write."""
+
+STEADY = 10.0
+"""Seconds without a failed attempt, and with nothing left to write, after which writing works again: on a disk that is
+nearly full, some attempts succeed."""
 
 PATIENCE = 10.0
 """Longest time that the start waits for a slow disk in each step, seconds."""
@@ -66,34 +66,6 @@ def drive_file(path: Path) -> Path | None:
         return path if is_journal(path) else None
     except OSError:
         return None
-
-
-class _Item(NamedTuple):
-    """Rows that wait for the file of a drive.
-
-    `readings` and `size` are their numbers of readings and bytes, `following` is the number of the next reading.
-    """
-
-    drive: Drive
-    rows: Iterable[Insert]
-    readings: int
-    size: int
-    following: int
-
-
-@dataclass(frozen=True)
-class _Everything:
-    """The rows of a whole drive, made by the writing thread, since this may take long and the node cannot wait."""
-
-    head: list[Insert]
-    readings: Readings
-    numbers: Mapping[str, int]
-    path: list[tuple[float, float]]
-
-    def __iter__(self) -> Iterator[Insert]:
-        yield from self.head
-        yield from path_rows(self.path, 0)
-        yield from reading_rows(self.readings, self.numbers, 0)
 
 
 class Journal:
@@ -130,8 +102,8 @@ class Journal:
         self.lost = 0
         self.contents = Contents()
         self.parameters: dict[str, Any] = {}
-        self._pending: deque[_Item] = deque()
-        self._bytes = self._unwritten = 0
+        self._backlog = Backlog()
+        self._last_failed = 0.0
         self._wake = threading.Condition()
         self._closing = False
         self._syncer: Syncer | None = None
@@ -164,7 +136,7 @@ class Journal:
     @property
     def unwritten(self) -> int:
         """Number of readings that wait to be written."""
-        return self._unwritten
+        return self._backlog.readings
 
     def restore(self) -> Iterator[Readings]:
         """Yield the readings of the current drive, and begin to accept new ones.
@@ -202,7 +174,7 @@ class Journal:
             for found in read(source, contents):
                 yield found
                 self.put(found, (contents.map_frame, contents.base_frame))
-                self._wait_for(lambda: self._bytes <= MOST_PENDING // 2)
+                self._wait_for(lambda: self._backlog.bytes <= MOST_PENDING // 2)
         except BagError as error:
             self._notice(f'{error}; the journal continues in {self.path.name}')
         self.put(None, (contents.map_frame, contents.base_frame), contents.path)
@@ -212,7 +184,7 @@ class Journal:
     def put(self, readings: Readings | None, frames: tuple[str, str], path: Iterable[tuple[float, float]] = ()) -> None:
         """Append readings, new points of the robot's path, and the map and base frame if they are new."""
         count = 0 if readings is None else len(readings)
-        if self._bytes > MOST_PENDING:
+        if self._backlog.bytes > MOST_PENDING:
             if not self.lost:
                 self._warn(
                     f'journal {self.path}: too many readings wait to be written; new readings are lost from now on'
@@ -243,7 +215,7 @@ class Journal:
         head = self._head(readings, frames)
         points = list(path)
         self._next, self._next_points = len(readings), len(points)
-        self._queue(_Everything(head, readings, dict(self._numbers), points), len(readings), 0)
+        self._queue(Everything(head, readings, dict(self._numbers), points), len(readings), 0)
 
     def close(self, seconds: float = 2.0) -> None:
         """Write the remaining rows if this takes at most so many seconds, and unlock the folder."""
@@ -264,9 +236,7 @@ class Journal:
         with self._wake:
             if self._drive.gone:
                 # rows for a file that will not return
-                self._pending = deque(item for item in self._pending if item.drive is not self._drive)
-                self._bytes = sum(item.size for item in self._pending)
-                self._unwritten = sum(item.readings for item in self._pending)
+                self._backlog.drop(self._drive)
             self._drive = Drive(following(self._drive.path))
         self._numbers, self._stated = {}, ()
         self._next = self._next_points = 0
@@ -287,9 +257,7 @@ class Journal:
 
     def _queue(self, rows: Iterable[Insert], readings: int, size: int) -> None:
         with self._wake:
-            self._pending.append(_Item(self._drive, rows, readings, size, self._next))
-            self._bytes += size
-            self._unwritten += readings
+            self._backlog.append(Item(self._drive, rows, readings, size, self._next))
             self._wake.notify_all()
 
     # in the background
@@ -315,8 +283,8 @@ class Journal:
     def _work(self, syncer: Syncer) -> None:
         while True:
             with self._wake:
-                self._wake.wait_for(lambda: self._closing or self._due(), CHECK_PERIOD)
-                items = self._batch()
+                self._wake.wait_for(lambda: self._closing or self._backlog.due, CHECK_PERIOD)
+                items = self._backlog.batch()
                 if not items and self._closing:
                     break
             try:
@@ -324,43 +292,31 @@ class Journal:
                     self._write(items)
                 else:
                     self._writer.check_file()
+                    self._steady()
             except GoneError as error:
                 self._lose(error.drive, str(error))
             except Exception as error:
                 # of any class: the thread must not end silently
-                if self._failed(error):
+                if not self._smaller(items) and self._failed(error):
                     break
         self._let_go()
         syncer.close(0.0)
 
-    def _due(self) -> bool:
-        return bool(self._pending) and not self._pending[0].drive.gone
-
-    def _batch(self) -> list[_Item]:
-        """Return the items of the next commit: of one drive, up to `BATCH` bytes or else one item."""
-        items: list[_Item] = []
-        size = 0
-        for item in self._pending if self._due() else ():
-            size += item.size
-            if items and (item.drive is not items[0].drive or size > BATCH):
-                break
-            items.append(item)
-        return items
-
-    def _write(self, items: list[_Item]) -> None:
+    def _write(self, items: list[Item]) -> None:
         rows = itertools.chain.from_iterable(item.rows for item in items)
         log = self._writer.write(items[0].drive, rows, items[-1].following)
         assert self._syncer is not None
         self._syncer.changed(log)
         with self._wake:
-            for item in items:
-                self._pending.popleft()
-                self._bytes -= item.size
-                self._unwritten -= item.readings
-            if self.trouble:
+            self._backlog.written(items)
+            self._wake.notify_all()
+
+    def _steady(self) -> None:
+        """End the trouble if nothing has failed for a while."""
+        with self._wake:
+            if self.trouble and not self._backlog and time.monotonic() >= self._last_failed + STEADY:
                 self._warn(f'journal {self.path}: writing works again')
                 self.trouble = ''
-            self._wake.notify_all()
 
     def _lose(self, drive: Drive, why: str) -> None:
         """Handle a file that vanished or was damaged."""
@@ -372,13 +328,18 @@ class Journal:
                 # an earlier drive: its remaining rows go to a new file
                 drive.path, drive.made, drive.next = following(drive.path), False, 0
 
+    def _smaller(self, items: list[Item]) -> bool:
+        """Return whether to try again at once with less."""
+        with self._wake:
+            return bool(items) and self._backlog.halve(items)
+
     def _failed(self, error: Exception) -> bool:
         """Report a failed write, and wait before the next attempt; return whether to give up."""
         trouble = _words(error)
         if trouble != self.trouble:
             self._warn(f'journal {self.path} cannot be written: {trouble}; mapping continues without it')
         with self._wake:
-            self.trouble = trouble
+            self.trouble, self._last_failed = trouble, time.monotonic()
             self._wake.notify_all()
             self._wake.wait_for(lambda: self._closing, RETRY)
             return self._closing

@@ -17,7 +17,7 @@ from ..core.maps.map_set import MapSet
 from ..core.messages.message_types import Pose2
 from ..core.messages.pose_association import PoseAssociator
 from ..core.messages.reading_buffer import bounded
-from ..core.trajectory.recovering import recovered
+from ..core.trajectory.recovering import recovered, that_placed
 from ..core.trajectory.windows import Odometry
 from ..files.quality_warning import quality_warning
 from .background import Inbox, reason
@@ -279,7 +279,7 @@ class EmService:
                 self._publishers.publish('ml_map', generation, *before)
 
         parameters = self._parameters()
-        mounts = dict(self.mounts())
+        mounts, jumped = dict(self.mounts()), self._associator.time_jumps > 0
 
         def fresh() -> bool:
             waits = early and not begun.is_set()
@@ -287,8 +287,10 @@ class EmService:
 
         def drive() -> Drive:
             _, held, odometry = taken[0]
-            # after a restart, readings of the journal are the only record of the odometry before it
-            return Drive(recovered(Odometry.of(*odometry), held, mounts), held)
+            known = Odometry.of(*odometry)
+            # after a restart, readings of the journal are the only record of the odometry before it; but after a jump
+            # back of the clock, the times of both overlap
+            return Drive(that_placed(held, known, mounts) if jumped else recovered(known, held, mounts), held)
 
         def now() -> Drive:
             _, held, odometry = take_now()

@@ -22,9 +22,9 @@ from ..core.maps.log_odds_map import LogOddsMap
 from ..core.messages.message_types import Pose2
 from ..core.messages.pose_association import PoseAssociator
 from ..core.trajectory.correction import Correction
-from ..core.trajectory.jumps import jumps
+from ..core.trajectory.jumps import jumps, may_jump
 from ..core.trajectory.refinement import SHORTEST
-from ..core.trajectory.windows import Odometry
+from ..core.trajectory.windows import STILL, Odometry
 from ..files.report_text import UNTESTED
 from ..files.trajectory_text import calibration_words
 from .background import Worker
@@ -95,7 +95,7 @@ class Trajectory:
     following : Following or None
         Continues the trajectory while the robot drives; None if this is not wanted.
     driven : float
-        Metres since the begin of the drive, up to the last check.
+        Metres since the begin of the drive, up to the last check; without noise of odometry while the robot stands.
     """
 
     def __init__(self, node: Any, associator: PoseAssociator, clock: Any) -> None:
@@ -113,6 +113,7 @@ class Trajectory:
         self.following: Following | None = None
         self.driven = self._refined_at = self._shown_at = 0.0
         self._at: tuple[int, Pose2] | None = None
+        self._counted: Pose2 | None = None
         self._ahead: tuple[int, float] | None = None
         self._jump: _Jump | None = None
         self._since = -1
@@ -155,7 +156,8 @@ class Trajectory:
         if self.following is not None:
             self.following.begin(None)
         self.driven = self._refined_at = self._shown_at = 0.0
-        self._at, self._jump, newest = None, None, self._associator.record.newest
+        self._at = self._counted = self._jump = None
+        newest = self._associator.record.newest
         # the path begins with the drive
         self._since = -1 if newest is None else newest[0]
         self._jumps = self._associator.time_jumps
@@ -254,7 +256,7 @@ class Trajectory:
             return
         if associator.time_jumps != self._jumps:
             self._jumps, self._since = associator.time_jumps, -1
-            self._at = self._jump = None
+            self._at = self._counted = self._jump = None
             self._out.forget()
         if associator.odometry_ahead and not self._lasts(newest[0]):
             return
@@ -294,12 +296,22 @@ class Trajectory:
 
     def _add_distance(self, before: tuple[int, Pose2], stamp: int, pose: Pose2) -> None:
         """Add the distance driven since the last check, without jumps; many messages may have arrived since."""
-        recent = Odometry(*self._associator.record.since(before[0] - RECENT))
-        first, at = int(np.searchsorted(recent.stamp, before[0])), jumps(recent)
+        if may_jump(Odometry(*self._associator.record.since(before[0]))) and self._add_jump(before[0]):
+            self._counted = pose
+            return
+        # odometry of a robot that stands may be noisy: it would drive 100 m in an hour at a dock
+        self._counted = self._counted or before[1]
+        far = math.dist(self._counted[:2], pose[:2])
+        if far >= STILL:
+            self.driven, self._counted = self.driven + far, pose
+
+    def _add_jump(self, before: int) -> bool:
+        """Add the distance driven since a stamp, if odometry jumped after it; return whether it did."""
+        recent = Odometry(*self._associator.record.since(before - RECENT))
+        first, at = int(np.searchsorted(recent.stamp, before)), jumps(recent)
         at = at[at > first]
         if not len(at):
-            self.driven += math.dist(before[1][:2], pose[:2])
-            return
+            return False
         steps = np.hypot(*np.diff(recent.pose[:, :2], axis=0).T)
         far, last = float(steps[at[-1] - 1]), int(at[-1])
         steps[:first], steps[at - 1] = 0.0, 0.0
@@ -307,6 +319,7 @@ class Trajectory:
         known, self._jump = self._jump is not None, _Jump(int(recent.stamp[last]), far, begin)
         if self._parameters.node.refine_poses and not known:
             self._node.get_logger().warning(str(self._jump))
+        return True
 
     def _show_path(self) -> None:
         """Have the trajectory published, continued by poses of odometry in the map frame."""

@@ -220,6 +220,8 @@ def no_room(journal: Journal) -> Iterator[None]:
 
 def test_full_disk_gives_one_warning_and_readings_wait(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(journal_module, 'RETRY', 0.01)
+    monkeypatch.setattr(journal_module, 'STEADY', 0.1)
+    monkeypatch.setattr(journal_module, 'CHECK_PERIOD', 0.01)
     warnings: list[str] = []
     journal, _ = opened(tmp_path, warnings)
     written(journal, made(0, 10))
@@ -232,10 +234,37 @@ def test_full_disk_gives_one_warning_and_readings_wait(tmp_path: Path, monkeypat
         assert os.strerror(errno.ENOSPC) in warnings[0]
         assert journal.unwritten >= 400
     until(lambda: not journal.unwritten)
-    assert journal.trouble == ''
+    assert journal.trouble, 'the next attempt may fail'
+    until(lambda: not journal.trouble)
+    assert len(warnings) == 2 and 'writing works again' in warnings[1]
     journal.close()
     assert numbers(journal.path)[0] == [*range(10), *range(100, 600)]
     assert journal.lost == 0
+
+
+def test_nearly_full_disk_takes_what_fits_with_one_warning(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(journal_module, 'RETRY', 0.01)
+    warnings: list[str] = []
+    journal, _ = opened(tmp_path, warnings)
+    written(journal, made(0, 10))
+    with no_room(journal):
+        for k in range(1, 101):
+            journal.put(made(100 * k, 100), FRAMES)
+        until(lambda: journal.trouble)
+    database = journal._writer._database
+    assert database is not None
+    for pages in (60, 100, 120):
+        # another program frees some space, again and again; the readings need 200 pages
+        before = journal.unwritten
+        with no_room(journal):
+            database.execute(f'PRAGMA max_page_count={pages}')
+            until(lambda before=before: journal.unwritten < before - 500)
+            time.sleep(0.1)
+            assert journal.unwritten and journal.trouble
+    assert len(warnings) == 1
+    until(lambda: not journal.unwritten)
+    journal.close()
+    assert numbers(journal.path)[0] == [*range(10), *range(100, 10100)]
 
 
 def test_readings_that_wait_for_a_disk_are_bounded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -66,6 +66,37 @@ def test_node_refines_soon_after_a_jump(
     assert node.em.maps is first and node.em.current is None, 'once is enough'
 
 
+def test_noise_of_odometry_at_standstill_is_no_driving(inside: Callable[..., Inside], quick: Any) -> None:
+    robot = inside(refine_poses=True, refine_every=1.0).start()
+    trajectory, noise = robot.node.trajectory, np.random.default_rng(0).normal(0.0, 0.001, 2000)
+    for k, off in enumerate(noise.tolist()):
+        robot.odometry(100.0 + 0.05 * k, off)
+        trajectory._tick()
+    assert trajectory.driven == 0.0 and np.abs(np.diff(noise)).sum() > 2.0
+    # a robot that creeps at 2 mm/s drives nevertheless
+    for k in range(5000):
+        robot.odometry(200.0 + 0.05 * k, 0.0001 * k)
+        trajectory._tick()
+    assert trajectory.driven == pytest.approx(0.5, abs=0.02)
+
+
+def test_usual_steps_of_odometry_are_only_looked_up_after_a_long_step(
+    inside: Callable[..., Inside], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    robot = inside(refine_poses=True).start()
+    sizes: list[int] = []
+    find = trajectory.jumps
+    monkeypatch.setattr(trajectory, 'jumps', lambda odometry: sizes.append(len(odometry.stamp)) or find(odometry))
+    for k in range(2000):
+        robot.odometry(100.0 + 0.001 * k, 0.0005 * k)
+        if k % 50 == 0:
+            robot.node.trajectory._tick()
+    assert not sizes, 'at 1 kHz, the last minute has 60 000 poses'
+    robot.odometry(102.0, 9.0)
+    robot.node.trajectory._tick()
+    assert sizes == [2001] and robot.node.trajectory._jump is not None
+
+
 def test_node_does_not_refine_at_each_step(inside: Callable[..., Inside], quick: Any) -> None:
     robot = inside(refine_poses=True, refine_every=1e-9).start()
     begin(robot)

@@ -316,6 +316,41 @@ def test_odometry_is_recovered_from_the_journal_after_a_restart(
     assert_live(robot, seen[-1])
 
 
+@pytest.mark.parametrize(
+    ('back', 'looped', 'kept'), [(4.0, False, 0), (10.0, False, 0), (20.0, False, 250), (7.45, True, 250)]
+)
+def test_odometry_after_the_clock_jumped_back_is_only_that_of_its_readings(
+    inside: Callable[..., Inside], quick: Any, monkeypatch: pytest.MonkeyPatch, back: float, looped: bool, kept: int
+) -> None:
+    """Readings from before may have stamps that odometry reaches a second time, elsewhere."""
+    robot = inside(refine_poses=True).start()
+    # 2 m in 7.5 s
+    for k in range(150):
+        robot.odometry(100.0 + 0.05 * k, k / 75.0)
+        robot.range(100.0 + 0.05 * k)
+    first = 107.45 - back
+    for k in range(250):
+        # the robot drives on, or the bag is played again
+        robot.odometry(first + 0.05 * k, (0.0 if looped else 2.0) + k / 75.0)
+        robot.range(first + 0.05 * k)
+    robot.until(lambda: not robot.node.intake.busy)
+    assert robot.node.associator.time_jumps == 1 and len(robot.node.associator.buffer) == 400
+    seen: list[Odometry] = []
+    run = quick.run
+
+    def look(self: Any, readings: Any, odometry: Odometry, watch: Any) -> Any:
+        seen.append(odometry)
+        return run(self, readings, odometry, watch)
+
+    monkeypatch.setattr(quick, 'run', look)
+    robot.call(robot.node.em.run_em)
+    first_kept = seen[0].stamp[0] * 1e-9
+    if kept:
+        assert len(seen[0].stamp) == kept and first_kept == pytest.approx(first)
+    else:
+        assert first_kept > 107.45, 'the refinement then says that there are readings without odometry'
+
+
 def test_odometry_in_frame_map_is_not_refined_with_reason(inside: Callable[..., Inside], quick: Any) -> None:
     robot = inside(refine_poses=True, map_frame='odom').start()
     robot.drive(0, 60)

@@ -102,6 +102,13 @@ def doubtful_steps(odometry: Odometry) -> NDArray[np.int64]:
     return found[doubtful]
 
 
+def may_jump(odometry: Odometry) -> bool:
+    """Return whether a step may be a jump; it is quick, since it does not ask which steps are usual."""
+    pose = odometry.pose
+    far = np.hypot(*np.diff(pose[:, :2], axis=0).T)
+    return bool(((far > LONGEST_STEP) | _turned_too_fast(np.diff(pose[:, 2]), np.diff(odometry.stamp) * 1e-9)).any())
+
+
 def _found(odometry: Odometry) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
     """Return the indices of the poses after jumps and doubtful steps, and which of them are doubtful."""
     seconds, pose = np.diff(odometry.stamp) * 1e-9, odometry.pose
@@ -339,16 +346,19 @@ class _FitCheck:
     def __init__(self, part: Part, parameters: Parameters, stop: NDArray[np.uint8]) -> None:
         readings, path = part.readings, part.path
         travel = np.interp(readings.stamp - path.stamp[0], path.stamp - path.stamp[0], path.travel)
-        own = readings.select(travel <= OWN_MAP)
+        own, begin = readings.select(travel <= OWN_MAP), path.pose[0]
         self._count = int(np.count_nonzero(travel <= FIRST_METRES))
-        begin = path.pose[0]
-        self._own = OnMap(own, begin, own, parameters, stop).of_each(begin, self._count)
+        # there are none if other readings of the place were kept (`max_readings`)
+        if self._count >= FEWEST_KNOWN:
+            self._own = OnMap(own, begin, own, parameters, stop).of_each(begin, self._count)
 
     def fits(self, around: OnMap, begin: Floats, least: float) -> bool:
         """Return whether the score of readings on the map is at least a fraction `least` of that on their own map.
 
         Enough of the readings must lie on the map.
         """
+        if self._count < FEWEST_KNOWN:
+            return False
         there = around.of_each(begin, self._count)
         known = np.abs(there) > SILENT
         if np.count_nonzero(known) < max(LEAST_KNOWN * len(known), FEWEST_KNOWN):

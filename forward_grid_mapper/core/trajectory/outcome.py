@@ -120,11 +120,14 @@ def with_outliers(found: Refinement, readings: Readings, odometry: Odometry, cou
         if count > 1
         else 'one pose of odometry is an outlier (a jump and back)'
     )
-    reason = f'{found.reason}; {named}'
+    return with_all_poses(replace(found, reason=f'{found.reason}; {named}'), readings, odometry)
+
+
+def with_all_poses(found: Refinement, readings: Readings, odometry: Odometry) -> Refinement:
+    """Return the result for a drive from the one for some poses of its odometry."""
     if not found.accepted:
-        return replace(found, reason=reason, readings=readings, trajectory=odometry)
-    trajectory = Odometry.of(odometry.stamp, found.trajectory.at(odometry.stamp))
-    return replace(found, reason=reason, trajectory=trajectory)
+        return replace(found, readings=readings, trajectory=odometry)
+    return replace(found, trajectory=Odometry.of(odometry.stamp, found.trajectory.at(odometry.stamp)))
 
 
 def replaced(readings: Readings, odometry: Odometry, trajectory: Odometry) -> Readings:

@@ -5,10 +5,14 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ..common.readings import Readings
-from .poses import compose, inverse
+from .poses import Floats, compose, inverse
 from .windows import Odometry
+
+ELSEWHERE = 0.1
+"""Metres; interpolation between poses of odometry is off by less."""
 
 
 def recovered(odometry: Odometry, readings: Readings, mounts: Mapping[str, Sequence[float]]) -> Odometry:
@@ -31,15 +35,35 @@ def recovered(odometry: Odometry, readings: Readings, mounts: Mapping[str, Seque
     Odometry
         `odometry` itself if there is no earlier reading of a fixed sensor.
     """
+    stamp, robot = _robot(readings, mounts)
+    early = stamp < odometry.stamp[0] if len(odometry.stamp) else np.ones(len(stamp), np.bool_)
+    if not early.any():
+        return odometry
+    return Odometry.of(np.concatenate([stamp[early], odometry.stamp]), np.concatenate([robot[early], odometry.pose]))
+
+
+def that_placed(readings: Readings, odometry: Odometry, mounts: Mapping[str, Sequence[float]]) -> Odometry:
+    """Return the odometry after the last reading that it did not place, as it is after the clock jumped back.
+
+    The robot was elsewhere when the clock showed that time before. The parameters are those of `recovered`.
+    """
+    if not len(odometry.stamp):
+        return odometry
+    stamp, robot = _robot(readings, mounts)
+    within = (stamp >= odometry.stamp[0]) & (stamp <= odometry.stamp[-1])
+    stamp, robot = stamp[within], robot[within]
+    elsewhere = np.hypot(*(robot - odometry.at(stamp))[:, :2].T) > ELSEWHERE
+    after = int(stamp[elsewhere].max(initial=-1)) + 1
+    return odometry.between(after, int(odometry.stamp[-1])) if elsewhere.any() else odometry
+
+
+def _robot(readings: Readings, mounts: Mapping[str, Sequence[float]]) -> tuple[NDArray[np.int64], Floats]:
+    """Return the stamps of the readings of fixed sensors, and the poses of the robot that placed them, shape (N, 3)."""
     poses = [mounts.get(name.lstrip('/'), mounts.get(name)) for name in readings.sensor_names]
     known = np.array([pose is not None for pose in poses], np.bool_)
-    early = np.ones(len(readings), np.bool_)
-    if len(odometry.stamp):
-        early = readings.stamp < odometry.stamp[0]
-    which = np.flatnonzero(early & known[readings.sensor]) if len(known) else np.zeros(0, np.int64)
+    which = np.flatnonzero(known[readings.sensor]) if len(known) else np.zeros(0, np.int64)
     if not len(which):
-        return odometry
+        return np.zeros(0, np.int64), np.zeros((0, 3))
     back = np.array([inverse(np.array(pose, np.float64)) if pose is not None else np.zeros(3) for pose in poses])
     sensors = np.stack([readings.x[which], readings.y[which], readings.yaw[which]], axis=1)
-    robot = compose(sensors, back[readings.sensor[which]])
-    return Odometry.of(np.concatenate([readings.stamp[which], odometry.stamp]), np.concatenate([robot, odometry.pose]))
+    return readings.stamp[which], compose(sensors, back[readings.sensor[which]])

@@ -32,11 +32,12 @@ from .judging import gain_at_revisits, gain_of_objective, gain_over_drive, last_
 from .jumps import MOST_JUMPS, Part, begins_of, jumps, parts_at, with_doubtful, without_outliers
 from .local_map import for_matching
 from .odometry_model import CALIBRATION
-from .outcome import Refinement, differences, joined_parts, replaced, with_outliers
+from .outcome import Refinement, differences, joined_parts, replaced, with_all_poses, with_outliers
 from .poses import Floats, compose, inverse
 from .relocating import LEAST_RECOGNISED, recognised_part
 from .scans import Scans
 from .solving import Solver
+from .standing import without_stands
 from .walls import wall_votes
 from .windows import TRAVEL, Odometry, Windows, corrected, cut
 
@@ -127,6 +128,8 @@ class Refiner:
         self._watch = watch
         if reason := without_times(readings, odometry):
             return Refinement(False, reason, readings, odometry, {})
+        if (moving := without_stands(odometry)) is not odometry:
+            return with_all_poses(self.run(replaced(readings, odometry, moving), moving, watch), readings, odometry)
         if (sound := without_outliers(odometry)) is not odometry:
             found = self.run(replaced(readings, odometry, sound), sound, watch)
             return with_outliers(found, readings, odometry, len(odometry.stamp) - len(sound.stamp))

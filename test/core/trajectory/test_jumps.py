@@ -155,6 +155,19 @@ def test_doubtful_step_is_judged_by_readings_up_to_the_next_jump(monkeypatch: py
     assert judged == [(150, 150)]
 
 
+def test_part_without_readings_at_its_begin_is_not_placed(bent: tuple[Readings, Odometry]) -> None:
+    """With `max_readings`, those of a later visit may have been kept."""
+    readings, odometry = bent
+    half = len(odometry.stamp) // 2
+    paths = [Odometry(odometry.stamp[part], odometry.pose[part]) for part in (slice(half), slice(half, None))]
+    far = paths[1].travel > jumping.OWN_MAP
+    begin = readings.stamp < paths[1].stamp[0], readings.stamp > paths[1].stamp[far][0]
+    parts = [jumping.Part(readings.select(w), path, path, False) for w, path in zip(begin, paths, strict=True)]
+    assert len(parts[1].readings) >= jumping.FEWEST_READINGS
+    found = jumping.begins_of(parts, Parameters(), np.zeros(1, np.uint8))
+    assert [each.how for each in found] == [jumping.FIRST, jumping.UNKNOWN]
+
+
 def test_drive_without_jumps_has_no_jumps(bent: tuple[Readings, Odometry]) -> None:
     _, odometry = bent
     assert not len(jumps(odometry))

@@ -1,0 +1,110 @@
+"""Rows that wait for the file of a journal, and how many of them are committed at once."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass
+from typing import NamedTuple
+
+from ..core.common.readings import Readings
+from .journal_database import Drive
+from .journal_format import Insert, path_rows, reading_rows
+
+BATCH = 4 << 20
+"""Most bytes of one commit, unless one item has more."""
+
+MOST_ITEMS = 1 << 16
+"""Most items of one commit."""
+
+
+class Item(NamedTuple):
+    """Rows that wait for the file of a drive.
+
+    `readings` and `size` are their numbers of readings and bytes, `following` is the number of the next reading.
+    """
+
+    drive: Drive
+    rows: Iterable[Insert]
+    readings: int
+    size: int
+    following: int
+
+
+@dataclass(frozen=True)
+class Everything:
+    """The rows of a whole drive, made by the writing thread, since this may take long and the node cannot wait."""
+
+    head: list[Insert]
+    readings: Readings
+    numbers: Mapping[str, int]
+    path: list[tuple[float, float]]
+
+    def __iter__(self) -> Iterator[Insert]:
+        yield from self.head
+        yield from path_rows(self.path, 0)
+        yield from reading_rows(self.readings, self.numbers, 0)
+
+
+class Backlog:
+    """A queue of items; not for several threads at once.
+
+    Attributes
+    ----------
+    bytes, readings : int
+        Of all items.
+    """
+
+    def __init__(self) -> None:
+        self._items: deque[Item] = deque()
+        self._most = MOST_ITEMS
+        self.bytes = self.readings = 0
+
+    def __len__(self) -> int:
+        return len(self._items)
+
+    @property
+    def due(self) -> bool:
+        """Whether there is an item, and its file is there."""
+        return bool(self._items) and not self._items[0].drive.gone
+
+    def append(self, item: Item) -> None:
+        """Add an item at the end."""
+        self._items.append(item)
+        self.bytes += item.size
+        self.readings += item.readings
+
+    def drop(self, drive: Drive) -> None:
+        """Remove the items of a drive."""
+        items, self._items = self._items, deque()
+        self.bytes = self.readings = 0
+        for item in items:
+            if item.drive is not drive:
+                self.append(item)
+
+    def batch(self) -> list[Item]:
+        """Return the items of the next commit: the first ones, of one drive; none if they are not due."""
+        items: list[Item] = []
+        size = 0
+        for item in self._items if self.due else ():
+            size += item.size
+            if items and (item.drive is not items[0].drive or size > BATCH or len(items) >= self._most):
+                break
+            items.append(item)
+        return items
+
+    def written(self, items: list[Item]) -> None:
+        """Remove the items of a commit; the next one may be larger."""
+        for item in items:
+            self._items.popleft()
+            self.bytes -= item.size
+            self.readings -= item.readings
+        self._most = min(2 * self._most, MOST_ITEMS)
+
+    def halve(self, items: list[Item]) -> bool:
+        """Make the next commit smaller, since that of `items` failed; return whether this is possible.
+
+        So as many rows as fit are written to a nearly full disk.
+        """
+        self._most = max(len(items) // 2, 1)
+        return len(items) > 1
