@@ -252,7 +252,7 @@ def read_drive(
                 f'{path} has no reading in the part {part}; its messages span {(last - first) / 1e9:.1f} s'
             )
         raise _nothing_associated(associator, lookup, spans, undecodable, poses)
-    stamps = associator.readings.stamp
+    first, last = associator.buffer.stamps
     source = {
         'bag': readable(path),
         'range_topics': list(topics.range_topics),
@@ -262,8 +262,8 @@ def read_drive(
         'base_frame': associator.base_frame,
         'mounts_from': ' and '.join(sorted(set(lookup.used.values()))),
         'extrinsics': lookup.poses,
-        'stamps': [int(stamps.min()), int(stamps.max())],
-        'duration_s': float(stamps.max() - stamps.min()) / NANOSECONDS,
+        'stamps': [first, last],
+        'duration_s': (last - first) / NANOSECONDS,
         'path_m': length_of(associator),
         'counts': {
             'received': associator.received,

@@ -73,3 +73,19 @@ def test_part_of_a_drive_without_stamps_is_rejected(tmp_path: Path) -> None:
     path = write_tape(tmp_path / 'bag', drive, logged=[(k + 1, m) for k, (_, m) in enumerate(in_turn(drive))])
     with pytest.raises(InputError, match='no reading in the part'):
         read(path, part=Part(2.0))
+
+
+def test_duration_and_begin_are_those_of_the_drive_if_most_readings_are_left_out(tmp_path: Path) -> None:
+    """A robot stands at its dock before the drive: these readings are the oldest of one place and direction."""
+    whole, wait = tape(), 40
+    first, second = whole.odometry[0], NANOSECONDS
+    earlier = range(first.stamp - wait * second, first.stamp, second // 10)
+    standing = [first._replace(stamp=stamp) for stamp in earlier]
+    heard = [m for m in whole.ranges if m.stamp == whole.ranges[0].stamp]
+    waiting = [m._replace(stamp=stamp) for stamp in earlier for m in heard]
+    drive = whole._replace(odometry=standing + whole.odometry, ranges=waiting + whole.ranges)
+    bag = write_tape(tmp_path / 'bag', drive)
+    source = read_drives([bag], Parameters.from_flat({'max_readings': 300}), {}).source
+    assert source['counts']['accepted'] == len(drive.ranges)
+    assert source['stamps'] == [earlier[0], whole.ranges[-1].stamp]
+    assert source['duration_s'] == pytest.approx((whole.ranges[-1].stamp - earlier[0]) / second)

@@ -88,6 +88,7 @@ class ReadingBuffer:
             self._size = self._count = 0
             self._names: dict[str, int] = {}
             self._columns: Columns = {name: np.empty(1024, kind) for name, kind in self._TYPES.items()}
+        self._first, self._last = sys.maxsize, -sys.maxsize
         self._counts: list[int] = []
         self._silent: list[int] = []
         self._begin_anew()
@@ -99,6 +100,7 @@ class ReadingBuffer:
         number = self._number_of(sensor)
         self._counts[number] += 1
         self._silent[number] += values['z'] >= values['z_max']
+        self._first, self._last = min(self._first, stamp := int(values['stamp'])), max(self._last, stamp)
         values['sensor'], values['number'] = number, self._count
         for name, column in self._columns.items():
             column[self._size] = values[name]
@@ -118,6 +120,9 @@ class ReadingBuffer:
         for number, count_of, silent in zip(sensors.tolist(), *readings.counts(), strict=False):
             self._counts[number] += count_of
             self._silent[number] += silent
+        if count:
+            self._first = min(self._first, int(readings.stamp.min()))
+            self._last = max(self._last, int(readings.stamp.max()))
         end = self._size + count
         for name, column in self._columns.items():
             if name == 'sensor':
@@ -129,6 +134,11 @@ class ReadingBuffer:
         self._size = end
         self._count += count
         self._thin()
+
+    @property
+    def stamps(self) -> tuple[int, int]:
+        """The first and the last stamp of all appended readings, also of thinned ones; there must be a reading."""
+        return self._first, self._last
 
     def counts(self) -> dict[str, tuple[int, int]]:
         """Return the number of appended readings of each sensor, and of those without echo."""
