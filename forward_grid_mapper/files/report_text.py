@@ -169,7 +169,10 @@ def _sensors(data: dict[str, Any]) -> Iterator[str]:
     if not sensors:
         return
     width = max(12, *(len(name) + 2 for name in sensors))
-    heads = ('accepted', 'max range', 'random', 'short')
+    counted_in = sum(row.get('accepted') or 0 for row in sensors.values())
+    # `max_readings` leaves out some of the accepted ones
+    all_used = counted_in >= ((data.get('counts') or {}).get('accepted') or 0)
+    heads = ('accepted' if all_used else 'used', 'max range', 'random', 'short')
     yield f'{"Sensors":<{width}}{"".join(f"{head:>10}" for head in heads)}  verdict'
     for name, row in sorted(sensors.items()):
         total, health = row.get('accepted'), row.get('health') or {}

@@ -136,3 +136,12 @@ def test_report_files_are_written(tmp_path: Path) -> None:
     assert (tmp_path / 'report.txt').read_text(encoding='utf-8') == report_text(data)
     with pytest.raises(OutputError, match=r'report\.json'):
         write_report(tmp_path / 'absent', data)
+
+
+def test_sensors_have_the_readings_used_if_max_readings_leaves_out_some() -> None:
+    maps = made_maps()
+    count = len(maps.readings)
+    for accepted, head in ((count, 'accepted'), (count + 1, 'used')):
+        data = report_data(maps, {'counts': {'received': accepted, 'accepted': accepted}})
+        row = next(line for line in report_text(data).splitlines() if line.startswith('Sensors'))
+        assert row.split()[:2] == ['Sensors', head]
