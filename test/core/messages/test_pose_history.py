@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 
+import numpy as np
 import pytest
 
 from forward_grid_mapper.core.messages.message_types import NANOSECONDS, Pose2
@@ -155,3 +156,24 @@ def test_dropped_pose_after_a_new_drive_is_not_counted() -> None:
     made.drop_newest()
     made.add(2 * SECOND, Pose2(5, 0, 0))
     assert made.record.since_anew == 1
+
+
+def test_a_stamp_far_before_the_others_does_not_look_at_all_poses(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of a driver whose stamps are zero, or late by an hour."""
+    made, start = PoseHistory(patient=True), 1000
+    stamps = [(start + k) * SECOND for k in range(7200)]
+    made.extend(stamps, [Pose2(k / 2, -k / 3, k / 7) for k in range(7200)])
+    asked = np.array([8000.5, 0, 4400.25, 8000, 999, 1000, 8100.75, 0, 4400]) * SECOND
+    looked, jumped = [], PoseHistory._jumped
+
+    def counted(self: PoseHistory, before: int, after: int) -> bool:
+        looked.append(after)
+        return jumped(self, before, after)
+
+    monkeypatch.setattr(PoseHistory, '_jumped', counted)
+    found = made.at_all(asked.astype(np.int64), 2.0)
+    assert len(looked) < 50
+    for stamp, reason, *pose in zip(asked.astype(np.int64).tolist(), *found, strict=True):
+        expected = made.at(stamp, 2.0)
+        assert reason == expected if isinstance(expected, str) else Pose2(*pose) == expected
+    assert not len(made.at_all(np.zeros(0, np.int64), 2.0).reason)
