@@ -287,14 +287,8 @@ def test_online_map_moves_with_the_trajectory(inside: Callable[..., Inside], qui
     assert not node.online.worker.trouble
 
 
-def test_odometry_is_recovered_from_the_journal_after_a_restart(
-    inside: Callable[..., Inside], quick: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    options = {'refine_poses': True, 'journal': str(tmp_path / 'journal')}
-    robot = inside(**options).start()
-    robot.drive(0, 150)
-    before = odometry_of(robot)
-    robot.close()
+def odometry_of_runs(quick: Any, monkeypatch: pytest.MonkeyPatch) -> list[Odometry]:
+    """Return a list to which each later run of the refiner appends the odometry that it is given."""
     seen: list[Odometry] = []
     run = quick.run
 
@@ -303,6 +297,18 @@ def test_odometry_is_recovered_from_the_journal_after_a_restart(
         return run(self, readings, odometry, watch)
 
     monkeypatch.setattr(quick, 'run', look)
+    return seen
+
+
+def test_odometry_is_recovered_from_the_journal_after_a_restart(
+    inside: Callable[..., Inside], quick: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    options = {'refine_poses': True, 'journal': str(tmp_path / 'journal')}
+    robot = inside(**options).start()
+    robot.drive(0, 150)
+    before = odometry_of(robot)
+    robot.close()
+    seen = odometry_of_runs(quick, monkeypatch)
     robot = inside(**options).start()
     assert len(robot.node.associator.buffer) == 150
     assert robot.call(robot.node.em.run_em)[0]
@@ -335,14 +341,7 @@ def test_odometry_after_the_clock_jumped_back_is_only_that_of_its_readings(
         robot.range(first + 0.05 * k)
     robot.until(lambda: not robot.node.intake.busy)
     assert robot.node.associator.time_jumps == 1 and len(robot.node.associator.buffer) == 400
-    seen: list[Odometry] = []
-    run = quick.run
-
-    def look(self: Any, readings: Any, odometry: Odometry, watch: Any) -> Any:
-        seen.append(odometry)
-        return run(self, readings, odometry, watch)
-
-    monkeypatch.setattr(quick, 'run', look)
+    seen = odometry_of_runs(quick, monkeypatch)
     robot.call(robot.node.em.run_em)
     first_kept = seen[0].stamp[0] * 1e-9
     if kept:
