@@ -8,11 +8,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..common.readings import Readings
-from .poses import Floats, compose, inverse
+from .poses import Floats, compose, inverse, wrapped
 from .windows import Odometry
 
 ELSEWHERE = 0.1
-"""Metres; interpolation between poses of odometry is off by less."""
+"""Metres, and radians; interpolation between poses of odometry is off by less."""
 
 
 def recovered(odometry: Odometry, readings: Readings, mounts: Mapping[str, Sequence[float]]) -> Odometry:
@@ -52,7 +52,8 @@ def that_placed(readings: Readings, odometry: Odometry, mounts: Mapping[str, Seq
     stamp, robot = _robot(readings, mounts)
     within = (stamp >= odometry.stamp[0]) & (stamp <= odometry.stamp[-1])
     stamp, robot = stamp[within], robot[within]
-    elsewhere = np.hypot(*(robot - odometry.at(stamp))[:, :2].T) > ELSEWHERE
+    off = robot - odometry.at(stamp)
+    elsewhere = (np.hypot(off[:, 0], off[:, 1]) > ELSEWHERE) | (np.abs(wrapped(off[:, 2])) > ELSEWHERE)
     after = int(stamp[elsewhere].max(initial=-1)) + 1
     return odometry.between(after, int(odometry.stamp[-1])) if elsewhere.any() else odometry
 

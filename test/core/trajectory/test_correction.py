@@ -9,7 +9,7 @@ from forward_grid_mapper.core.common.readings import Readings
 from forward_grid_mapper.core.trajectory.correction import Correction
 from forward_grid_mapper.core.trajectory.outcome import replaced
 from forward_grid_mapper.core.trajectory.poses import compose, wrapped
-from forward_grid_mapper.core.trajectory.recovering import recovered
+from forward_grid_mapper.core.trajectory.recovering import recovered, that_placed
 from forward_grid_mapper.core.trajectory.windows import Odometry
 
 MOUNTS = {'left': (0.1, 0.2, 1.0), 'right': (0.1, -0.2, -2.5)}
@@ -88,6 +88,19 @@ def test_missing_odometry_is_recovered_from_readings(seed: int) -> None:
     assert set(only.stamp[: -len(late.stamp)]) == set(readings.stamp[readings.sensor == 0]) - set(late.stamp)
     assert recovered(late, readings, {}) is late
     assert recovered(odometry, readings, MOUNTS) is odometry
+
+
+@pytest.mark.parametrize('moved', [(0.3, 0.0, 0.0), (0.0, 0.0, 0.4), (0.0, 0.0, -3.0)])
+def test_odometry_of_readings_taken_elsewhere_is_left_out(moved: tuple[float, float, float]) -> None:
+    rng = np.random.default_rng(4)
+    odometry = some_odometry(rng, 60)
+    # the clock jumped back: half of these times came before, when the robot stood elsewhere, or looked elsewhere
+    before = Odometry(odometry.stamp, compose(odometry.pose, np.array(moved)))
+    early = readings_at(rng, before, odometry.stamp[:30])
+    assert np.array_equal(that_placed(early, odometry, MOUNTS).stamp, odometry.stamp[30:])
+    assert that_placed(readings_at(rng, odometry, odometry.stamp), odometry, MOUNTS) is odometry
+    turned = Odometry(odometry.stamp, odometry.pose + np.array([0.0, 0.0, 2 * np.pi]))
+    assert that_placed(readings_at(rng, turned, odometry.stamp), odometry, MOUNTS) is odometry
 
 
 @pytest.mark.parametrize('seed', range(10))
