@@ -165,8 +165,7 @@ class RefiningMapper:
         outcome = keep_if_not_worse(before.refinement, before.correction, found, self._parameters, self._stop)
         if outcome.accepted:
             self._kept = found.reason
-            return outcome
-        return replace(found, reason=f'{found.reason}; and it is not worse than the trajectory of the previous run')
+        return outcome
 
     def _live_map(self, readings: Readings, correction: Correction | None) -> LogOddsMap:
         live = LogOddsMap(self._parameters)

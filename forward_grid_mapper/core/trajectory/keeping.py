@@ -6,6 +6,8 @@ windows decide between the earlier trajectory and odometry.
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -56,7 +58,8 @@ def keep_if_not_worse(
     path = correction.along(odometry)
     better = _gain_of_odometry(readings, odometry, path, for_matching(parameters), stop)
     if better.sigmas >= LEAST_SIGMAS:
-        return refused
+        reason = f'{refused.reason}; and it predicts the readings better than the trajectory of the previous run'
+        return replace(refused, reason=reason)
     moved, turned = differences(odometry, path)
     return Refinement(
         True,

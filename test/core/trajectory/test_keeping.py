@@ -70,7 +70,9 @@ def test_earlier_trajectory_is_dropped_if_odometry_is_better(sample: Sample) -> 
     # the earlier trajectory is wrong, and odometry is exact
     wrong = Correction(first_of(sample.true, 0.7), first_of(sample.odometry, 0.7))
     refused = replace(sample.refused, readings=sample.exact.readings, trajectory=sample.true)
-    assert outcome(sample, correction=wrong, refused=refused) is refused
+    found = outcome(sample, correction=wrong, refused=refused)
+    assert not found.accepted and found.trajectory is refused.trajectory
+    assert found.reason.startswith('the test says so; and it predicts the readings better')
 
 
 def test_earlier_trajectory_of_other_odometry_is_dropped(sample: Sample) -> None:
