@@ -97,6 +97,7 @@ class PoseAssociator(MessageAccount):
         self._path, self._history = RobotPath(), PoseHistory(patient)
         self.record = self._history.record
         self._newest_range: int | None = None
+        self._restored_until: int | None = None
         self._held: deque[tuple[Measurement, Pose2, Later]] = deque()
         self._retrying = 0
         self._next_try = self._next_look = 0
@@ -175,6 +176,7 @@ class PoseAssociator(MessageAccount):
         self._held.clear()
         self._retrying, self.behind = 0, False
         self._newest_range, self._next_try, self._next_look = None, 0, 0
+        self._restored_until = None
         self._path.clear()
         self._extent.clear()
 
@@ -203,6 +205,10 @@ class PoseAssociator(MessageAccount):
             self._drop_ahead()
         elif order == JUMPED_BACK:
             self._jump_back()
+        elif self._history.newest is None and self._restored_until is not None:
+            # the clock of an earlier run may have been ahead, as that of a simulation which began again
+            self.time_jumps += message.stamp < self._restored_until - JUMP
+            self._restored_until = None
         newest = self._history.newest
         self._history.add(message.stamp, message.pose)
         if self._history.newest != newest:
@@ -242,6 +248,7 @@ class PoseAssociator(MessageAccount):
         count = int(np.count_nonzero(admitted))
         if count:
             self.buffer.extend(readings if count == len(readings) else readings.select(admitted))
+            self._restored_until = max(int(readings.stamp[admitted].max()), self._restored_until or 0)
         return len(readings) - count
 
     def extend_path(self, point: tuple[float, float]) -> None:

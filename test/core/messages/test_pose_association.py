@@ -449,6 +449,26 @@ def test_clock_that_jumps_back_is_detected_at_once(back: float) -> None:
     assert (p.time_jumps, p.odometry_rejected, len(p.record)) == (1, {}, 1)
 
 
+@pytest.mark.parametrize(('first', 'jumps'), [(19.5, 0), (30.0, 0), (5.0, 1)])
+def test_clock_behind_restored_readings_jumped_back_once(first: float, jumps: int) -> None:
+    before = associator()
+    for k in range(100):
+        before.add_odometry(odometry(10.0 + 0.1 * k))
+        before.add_range(sonar(10.0 + 0.1 * k))
+    p = associator()
+    assert p.restore(before.buffer.snapshot()) == 0
+    # what waits is of the new time
+    p.add_range(sonar(first + 0.05))
+    p.add_odometry(odometry(first))
+    p.add_odometry(odometry(first + 0.1))
+    assert (p.time_jumps, len(p.buffer)) == (jumps, 101)
+    assert accounted(p)
+    p.clear()
+    p.add_odometry(odometry(1.0))
+    p.clear()
+    assert p.time_jumps == 0
+
+
 def test_clock_set_ahead_and_back_is_one_jump() -> None:
     p = associator()
     for second in (10.0, 10.1, 70.2, 70.3, 10.4, 10.5):
