@@ -103,7 +103,8 @@ def _copies(readings: Readings) -> str:
         return ''
     return (
         f'{copies} of {len(z)} readings are copies of others (same sensor, stamp and range), and their evidence '
-        'counts twice: was a topic recorded twice, or do two nodes publish it? Leave one of them out (range_topics)'
+        'counts twice: was a topic recorded twice, or do two nodes publish it? Leave one of them out (range_topics). '
+        'Was a bag played twice, or in a loop? Play it once'
     )
 
 
