@@ -53,7 +53,8 @@ class OdometryClock:
         if back > 0:
             self._warn(
                 f'the clock jumped back ({self._seen[0]} times so far): waiting readings were dropped, and so was the '
-                'odometry of the drive, which refine_poses needs; the map is kept'
+                'odometry of the drive, which refine_poses needs; the map is kept: call reset to begin a new one, as '
+                'after the restart of a simulation'
             )
         else:
             self._warn(

@@ -34,7 +34,7 @@ class Following:
         self.worker = Worker('following', log.error)
         self._log, self._inbox, self._changed = log, inbox, changed
         self._seen: Pose2 | None
-        self._busy, self._seen = False, None
+        self._busy, self._ended, self._seen = False, False, None
 
     @property
     def obstacle(self) -> str:
@@ -44,7 +44,7 @@ class Following:
     def begin(self, follower: Follower | None) -> None:
         """Replace the follower; None to end."""
         self.cancel()
-        self.follower, self._busy, self._seen = follower, False, None
+        self.follower, self._busy, self._ended, self._seen = follower, False, False, None
         self._say()
 
     def offer(
@@ -79,6 +79,14 @@ class Following:
 
         self.worker.put(work, failed)
 
+    def end(self, why: str) -> None:
+        """End following until the next `begin`, for a reason in words; the result of the current work is dropped."""
+        follower = self.follower
+        if follower is not None and not follower.obstacle:
+            follower.cancel()
+            follower.obstacle, self._ended = why, True
+            self._say()
+
     def cancel(self) -> None:
         """Cancel the current work; its result is dropped."""
         if self.follower is not None:
@@ -107,13 +115,11 @@ class Following:
         return seen is None or math.dist(at[:2], seen[:2]) >= STILL or abs(turn) >= STILL
 
     def _take(self, follower: Follower) -> None:
-        if follower is self.follower:
+        if follower is self.follower and not self._ended:
             self._busy = False
             self._changed(follower.correction)
             self._say()
 
     def _say(self) -> None:
         if self.obstacle:
-            self._log.warning(
-                f'map to odom is no longer followed: {self.obstacle}; it stays constant until the next run_em'
-            )
+            self._log.warning(f'map to odom is no longer followed until the next run_em: {self.obstacle}')

@@ -57,6 +57,9 @@ NEW_PART = 0.1
 """Fraction of the drive that must be new before the node refines by itself: a run uses the whole drive, so that at
 equal distances runs would cost more and more."""
 
+JUMPED_BACK = 'the clock jumped back'
+"""The reason why following ends; after it, stamps are those of an earlier part of the drive."""
+
 
 class _Jump(NamedTuple):
     """A jump of odometry: the stamp after it, nanoseconds; its size, and the distance driven before it, metres."""
@@ -103,7 +106,7 @@ class Trajectory:
         self._node, self._associator, self._clock = node, associator, clock
         self.publishing: Worker | None = None
         self._out: PosePublishers | None = None
-        self._jumps = 0
+        self._jumps = self._before_run = self._explained = 0
         self.on = self._parameters.node.refine_poses
         self.correction: Correction | None = None
         self.found: Found | None = None
@@ -137,6 +140,11 @@ class Trajectory:
         return self._associator.map_frame or str(self._parameters.node.map_frame)
 
     @property
+    def _jumped_back(self) -> bool:
+        """Whether the clock jumped back, and no run has found a trajectory since then."""
+        return self._associator.time_jumps > self._explained
+
+    @property
     def place(self) -> Callable[[Readings], Readings] | None:
         """The function that places readings in the map frame; None if they are not moved."""
         return None if self.correction is None else self.correction.apply
@@ -160,7 +168,7 @@ class Trajectory:
         newest = self._associator.record.newest
         # the path begins with the drive
         self._since = -1 if newest is None else newest[0]
-        self._jumps = self._associator.time_jumps
+        self._jumps, self._explained = self._associator.time_jumps, 0
         self._switch(self._parameters.node.refine_poses)
         if self._out is not None:
             self._out.forget()
@@ -170,7 +178,7 @@ class Trajectory:
         self, parameters: Parameters, drive: Callable[[], Drive], now: Callable[[], Drive]
     ) -> RefiningMapper | Mapper:
         """Return a mapper for a run; `drive` returns the drive at its begin, `now` the drive so far."""
-        self._refined_at = self.driven
+        self._refined_at, self._before_run = self.driven, self._associator.time_jumps
         refine, before = parameters.node.refine_poses and not self.obstacle, None
         if self.found is not None and self.correction is not None:
             before = self.found._replace(correction=self.correction)
@@ -188,8 +196,14 @@ class Trajectory:
         looked_at = refinement.trajectory.stamp[-1:] if refinement else np.zeros(0, np.int64)
         if self._jump is not None and (looked_at >= self._jump.stamp).any():
             self._jump = None
+        if self.correction is not None:
+            self._explained = self._before_run
         if self.following is not None:
-            self.following.begin(found.follower if found else None)
+            follower = found.follower if found else None
+            if follower is not None and self._jumped_back:
+                # during the run
+                follower.obstacle = JUMPED_BACK
+            self.following.begin(follower)
             if self.following.follower is not None:
                 self.correction = self.following.follower.correction
         self._switch(self.found is not None)
@@ -234,10 +248,16 @@ class Trajectory:
         message = self.outcome() or 'odometry is used until run_em is called'
         if self._jump is not None:
             message = f'{message}; {self._jump}'
+        if self._jumped_back:
+            message = (
+                f'{message}; {JUMPED_BACK}, and the odometry before it is gone: call reset to begin a new map, or, if '
+                'a bag loops, call run_em once it has been played again'
+            )
         troubled = (
             self.obstacle
             or (self.following is not None and self.following.obstacle)
             or self._jump is not None
+            or self._jumped_back
             or (refinement is not None and refinement.unplaced)
         )
         level = DiagnosticStatus.WARN if troubled else DiagnosticStatus.OK
@@ -258,6 +278,8 @@ class Trajectory:
             self._jumps, self._since = associator.time_jumps, -1
             self._at = self._counted = self._jump = None
             self._out.forget()
+            if self.following is not None and self._jumped_back:
+                self.following.end(JUMPED_BACK)
         if associator.odometry_ahead and not self._lasts(newest[0]):
             return
         frames = self.frame, associator.map_frame, associator.base_frame

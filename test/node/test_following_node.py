@@ -196,6 +196,37 @@ def test_reset_ends_following(
     assert 'followed since the latest run' not in robot.status('trajectory')
 
 
+@pytest.mark.parametrize('when', ['driving', 'in a run'])
+def test_jump_back_of_the_clock_ends_following_until_a_run_finds_a_trajectory(
+    driving: Callable[..., Inside], drifting: DriftingDrive, monkeypatch: pytest.MonkeyPatch, when: str
+) -> None:
+    """Otherwise the follower would take the pose of another time for a jump of odometry, or for the next one."""
+    robot = driving()
+    node = robot.node
+    if when == 'driving':
+        robot.hand(drifting.parts[0])
+    else:
+        held = HeldRun(monkeypatch)
+        answer = robot.begin(node.em.run_em)
+        robot.until(held.begun.is_set)
+        robot.hand(drifting.parts[0])
+        held.go_on.set()
+        robot.until(lambda: answer.sent)
+    assert node.associator.time_jumps == 1
+    robot.until(lambda: node.trajectory.following.obstacle)
+    status = robot.status('trajectory')
+    assert status['level'] == WARN
+    assert 'the clock jumped back' in status['message'] and 'call reset' in status['message']
+    assert 'ended: the clock jumped back' in status['followed since the latest run']
+    # the bag has been played again
+    assert robot.call(node.em.run_em)[0]
+    assert robot.status('trajectory')['level'] == OK
+    assert not node.trajectory.following.obstacle
+    robot.hand(drifting.parts[1])
+    follow(robot, 10)
+    assert drifting.off(robot) < 0.35
+
+
 def test_following_continues_after_a_pause_and_other_parameters(
     driving: Callable[..., Inside], drifting: DriftingDrive
 ) -> None:

@@ -161,6 +161,33 @@ def test_obstacle_at_the_begin_is_reported_at_once(driving: Driving) -> None:
     assert driving.part.worker.waiting == 0
 
 
+@pytest.mark.parametrize('when', ['idle', 'working', 'done'])
+def test_following_is_ended_from_outside(driving: Driving, when: str) -> None:
+    follower = driving.begin(PlainFollower(), at_once=when != 'working')
+    driving.offer(HERE)
+    assert follower.begun.wait(60.0)
+    if when == 'idle':
+        driving.settle()
+    elif when == 'done':
+        driving.part.worker.ask(lambda: None)
+    for _ in range(2):
+        driving.part.end('the clock jumped back')
+    follower.go_on.set()
+    driving.settle()
+    driving.offer(THERE)
+    driving.settle()
+    assert len(follower.seen) == 1 and len(driving.corrections) == (when == 'idle')
+    assert [text.rpartition(': ')[2] for text in driving.node.warned] == ['the clock jumped back']
+    assert '; ended: the clock jumped back' in driving.part.values()['followed since the latest run']
+    other = driving.begin(PlainFollower())
+    driving.offer(HERE)
+    driving.settle()
+    assert other.windows == 1 and driving.corrections[-1] is other.correction
+    driving.begin(None)
+    driving.part.end('there is none')
+    assert len(driving.node.warned) == 1
+
+
 @pytest.mark.parametrize('end', ['another', 'none', 'cancel'])
 def test_results_of_a_replaced_follower_are_dropped(driving: Driving, end: str) -> None:
     before, other = driving.begin(PlainFollower(), at_once=False), PlainFollower()

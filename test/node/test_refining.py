@@ -122,7 +122,7 @@ def test_node_returns_to_odometry_if_it_is_better(
     assert_live(robot, None)
     assert (
         'odometry is used as the trajectory: the test says so; '
-        'and it is not worse than the trajectory of the previous run' in answer[1]
+        'and it predicts the readings better than the trajectory of the previous run' in answer[1]
     )
 
 
@@ -348,6 +348,46 @@ def test_odometry_after_the_clock_jumped_back_is_only_that_of_its_readings(
         assert len(seen[0].stamp) == kept and first_kept == pytest.approx(first)
     else:
         assert first_kept > 107.45, 'the refinement then says that there are readings without odometry'
+
+
+def test_jump_back_of_the_clock_gives_a_warning_until_reset(inside: Callable[..., Inside], quick: Any) -> None:
+    robot, _ = refined(inside(refine_poses=True).start())
+    trajectory = robot.node.trajectory
+    assert robot.status('trajectory')['level'] == OK
+    for k in range(20):
+        robot.odometry(80.0 + 0.05 * k, 3.0)
+        robot.range(80.0 + 0.05 * k)
+    robot.until(lambda: not robot.node.intake.busy)
+    quick.accepts = False
+    for _ in range(2):
+        status = robot.status('trajectory')
+        assert status['level'] == WARN
+        assert 'the clock jumped back' in status['message'] and 'call reset' in status['message']
+        answer = robot.call(robot.node.em.run_em)
+        assert answer[0] and 'the test says so' in answer[1]
+        assert 'previous run' not in answer[1], 'it was not compared, as its odometry is gone'
+    assert trajectory.correction is None
+    robot.call(robot.node.reset)
+    assert robot.status('trajectory')['level'] == OK
+
+
+def test_clock_that_is_behind_the_journal_has_jumped_back(
+    inside: Callable[..., Inside], quick: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As with a simulation that began again: its odometry has not placed the readings of the journal."""
+    options = {'refine_poses': True, 'journal': str(tmp_path / 'journal')}
+    robot = inside(**options).start()
+    robot.drive(0, 150)
+    robot.close()
+    robot = inside(**options).start()
+    for k in range(200):
+        robot.odometry(98.0 + 0.05 * k, 2.0 + 0.001 * k)
+        robot.range(98.0 + 0.05 * k)
+    robot.until(lambda: not robot.node.intake.busy)
+    assert len(robot.node.associator.buffer) == 350 and robot.node.associator.time_jumps == 1
+    seen = odometry_of_runs(quick, monkeypatch)
+    assert robot.call(robot.node.em.run_em)[0]
+    assert seen[0].stamp[0] * 1e-9 > 107.4, 'poses that did not place the readings of these times are not used'
 
 
 def test_odometry_in_frame_map_is_not_refined_with_reason(inside: Callable[..., Inside], quick: Any) -> None:
