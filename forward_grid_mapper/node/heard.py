@@ -23,8 +23,8 @@ def _patience(interval: float) -> float:
 class Heard:
     """The time of the last message of each sensor, and its usual interval.
 
-    A sensor is silent if others sent something long after it. So none is silent if no messages arrive at all, as when a
-    robot is switched off or a bag has ended.
+    A sensor is silent if others sent something long after it. The time in which no messages arrive at all does not
+    count, as when a robot is switched off, or a bag has ended or is paused.
     """
 
     def __init__(self) -> None:
@@ -43,7 +43,11 @@ class Heard:
 
     def note(self, frame: str) -> None:
         """Note a message of a sensor."""
-        now = self._newest = time.monotonic()
+        now = time.monotonic()
+        gap, self._newest = now - self._newest, now
+        if gap > TIME_OUT and gap > self.patience:
+            # after a pause of all sensors, the others are not silent because one of them is the first
+            self._sensors = {known: (last + gap, usual) for known, (last, usual) in self._sensors.items()}
         before = self._sensors.get(frame)
         if before is not None:
             last, interval = before
@@ -62,6 +66,6 @@ class Heard:
         return min((_patience(usual) for _, usual in self._sensors.values()), default=TIME_OUT)
 
     def silent(self) -> dict[str, float]:
-        """Return the silent sensors, and the seconds since their last message."""
+        """Return the silent sensors, and the seconds since their last message, without pauses of all."""
         now, newest = time.monotonic(), self._newest
         return {f: now - last for f, (last, usual) in self._sensors.items() if newest - last > _patience(usual)}
