@@ -136,10 +136,10 @@ class SensorClocks:
                 continue
             most = max(lags, key=lambda frame: lags[frame])
             others = f' (and {counted(len(lags) - 1, "sensor")} more)' if len(lags) > 1 else ''
-            busy = '; if the node has too little processor time, play the bag more slowly' if lags is behind else ''
             texts.append(
                 f'the stamps of {most}{others} are {lags[most] / NANOSECONDS:.1f} s {side} those of odometry: if a '
-                f'clock is wrong, its readings are mapped with wrong poses; synchronise the clocks (NTP, PTP){busy}'
+                'clock is wrong, its readings are mapped with wrong poses; synchronise the clocks (NTP, PTP); if the '
+                'node has too little processor time, play the bag more slowly'
             )
             if lags.keys() - self._logged:
                 self._logged |= lags.keys()
