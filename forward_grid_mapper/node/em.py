@@ -76,7 +76,9 @@ class Run:
         return time.monotonic() - self.begin
 
     def __str__(self) -> str:
-        text = f'{self.stage} of {self.count} readings, {self.seconds:.1f} s'
+        # their number is known once the run has begun
+        of = f' of {self.count} readings' if self.count else ''
+        text = f'{self.stage}{of}, {self.seconds:.1f} s'
         if self.progress:
             p = self.progress
             text += f', iteration {p.iterations}, {p.flips} flips, {p.gain:.0f} nats gained'

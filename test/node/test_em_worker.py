@@ -235,7 +235,7 @@ def test_text_of_a_run_has_its_progress(monkeypatch: pytest.MonkeyPatch) -> None
     run = Run(Mapper(Parameters()), Parameters(), lambda: READING)
     monkeypatch.setattr(em.time, 'monotonic', lambda: run.begin + 12.34)
     assert run.seconds == pytest.approx(12.34)
-    assert str(run) == 'starting of 0 readings, 12.3 s'
+    assert str(run) == 'starting, 12.3 s'
     assert not (run.by_itself or run.end_requested or run.shown or run.cancelled) and run.fresh()
     run.stage, run.count, run.progress = 'search', 70, Progress(3, 400, 5, 61.5)
     assert str(run).startswith('search of 70 readings, 12.3 s, iteration 3, ')
