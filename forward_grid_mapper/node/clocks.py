@@ -52,14 +52,14 @@ class OdometryClock:
         self._next = now + LASTING
         if back > 0:
             self._warn(
-                f'the clock jumped back ({self._seen[0]} times so far): waiting readings were dropped, and so was the '
-                'odometry of the drive, which refine_poses needs; the map is kept: call reset to begin a new one, as '
-                'after the restart of a simulation'
+                f'the clock jumped back ({counted(self._seen[0], "time")} so far): waiting readings were dropped, and '
+                'so was the odometry of the drive, which refine_poses needs; the map is kept: call reset to begin a '
+                'new one, as after the restart of a simulation'
             )
         else:
             self._warn(
-                f'the stamp of an odometry message was more than a second ahead of the others ({self._seen[1]} times '
-                'so far): this message is ignored'
+                'the stamp of an odometry message was more than a second ahead of the others '
+                f'({counted(self._seen[1], "time")} so far): this message is ignored'
             )
 
     def forget(self) -> None:
