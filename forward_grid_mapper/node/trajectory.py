@@ -227,7 +227,7 @@ class Trajectory:
             return []
         values: dict[str, Any] = {
             'map frame': self.frame,
-            'transform': 'on TF' if self._out is None or self._out.by_tf else 'none: tf2_ros is not installed',
+            'transform': self._transform(),
             'poses of odometry kept': self._associator.record.since_anew,
             'driven since the latest run (m)': f'{self.driven - self._refined_at:.1f}',
         }
@@ -262,6 +262,12 @@ class Trajectory:
         )
         level = DiagnosticStatus.WARN if troubled else DiagnosticStatus.OK
         return [status(f'{name}: trajectory', level, message, name, values)]
+
+    def _transform(self) -> str:
+        """Return where the transform from map to odometry is published, in words."""
+        if self._out is None or not self.on or self.obstacle:
+            return 'none: the maps are in the frame of odometry'
+        return 'on TF' if self._out.by_tf else 'none: tf2_ros is not installed'
 
     def _switch(self, on: bool) -> None:
         self.on = on

@@ -402,6 +402,19 @@ def test_odometry_in_frame_map_is_not_refined_with_reason(inside: Callable[..., 
     assert 'REP 105' in status['message']
 
 
+def test_transform_begins_with_the_first_run_if_refine_poses_is_set_later(
+    inside: Callable[..., Inside], quick: Any
+) -> None:
+    robot = inside().start()
+    robot.drive(0, 60)
+    robot.set(refine_poses=True)
+    nothing = 'none: the maps are in the frame of odometry'
+    assert robot.status('trajectory')['transform'] == nothing
+    assert robot.call(robot.node.em.run_em)[0]
+    assert robot.node.trajectory.frame == 'map'
+    assert robot.status('trajectory')['transform'] != nothing
+
+
 def test_refine_poses_cannot_change_the_source_of_the_transform(inside: Callable[..., Inside]) -> None:
     robot = inside(refine_poses=True, map_frame='building').start()
     robot.drive(0, 10)
