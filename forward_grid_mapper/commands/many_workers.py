@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import contextlib
 import dataclasses
 import math
 import os
@@ -109,31 +110,35 @@ def with_workers(
         part,
     )
     begun = time.perf_counter()
-    with Ticker(options.quiet) as ticker, output_folder(output) as folder:
-        again = work.begin(_described(recordings, of_all, size, versions()))
-        ticker.say('starting workers')
-        try:
-            with Cluster(options.workers or 1, options.scheduler, memory) as cluster:
-                if not options.quiet:
-                    told = f', the dashboard is at {cluster.dashboard}' if cluster.dashboard else ''
-                    going_on = ', continuing the previous work' if again else ''
-                    print(f'mapping in tiles of {size:g} m in {readable(work.path)}{going_on}{told}', file=sys.stderr)
-                job = Job(work, _for_worker(of_all, cluster.memory or memory), size, versions())
-                found = ScaledMapper(cluster, job, ticker.say).run(recordings, [*repeated, *meant.skipped, *ignored])
-                title = f'{readable(Path(*paths[0].resolve().parts[-2:]))}'
-                title += f' and {len(paths) - 1} more' if len(paths) > 1 else ''
-                report = write_output(folder, job, found, cluster, parameters, title, ticker.say)
-        except BaseException as error:
-            if not work.placed:
-                shutil.rmtree(work.root, ignore_errors=True)
+    with contextlib.ExitStack() as lock:
+        with Ticker(options.quiet) as ticker, output_folder(output) as folder:
+            again = work.begin(_described(recordings, of_all, size, versions()))
+            lock.enter_context(work.held())
+            ticker.say('starting workers')
+            try:
+                with Cluster(options.workers or 1, options.scheduler, memory) as cluster:
+                    if not options.quiet:
+                        told = f', the dashboard is at {cluster.dashboard}' if cluster.dashboard else ''
+                        going_on = ', continuing the previous work' if again else ''
+                        where = f'{readable(work.path)}{going_on}{told}'
+                        print(f'mapping in tiles of {size:g} m in {where}', file=sys.stderr)
+                    job = Job(work, _for_worker(of_all, cluster.memory or memory), size, versions())
+                    notes = [*repeated, *meant.skipped, *ignored]
+                    found = ScaledMapper(cluster, job, ticker.say).run(recordings, notes)
+                    title = f'{readable(Path(*paths[0].resolve().parts[-2:]))}'
+                    title += f' and {len(paths) - 1} more' if len(paths) > 1 else ''
+                    report = write_output(folder, job, found, cluster, parameters, title, ticker.say)
+            except BaseException as error:
+                if not work.placed:
+                    shutil.rmtree(work.root, ignore_errors=True)
+                    raise
+                kept = f'finished work is kept in {readable(work.path)}; the same command continues from there'
+                if isinstance(error, Cancelled):
+                    error.left = f'no results were written, {kept}'
+                else:
+                    print(kept, file=sys.stderr)
                 raise
-            kept = f'finished work is kept in {readable(work.path)}; the same command continues from there'
-            if isinstance(error, Cancelled):
-                error.left = f'no results were written, {kept}'
-            else:
-                print(kept, file=sys.stderr)
-            raise
-    shutil.rmtree(work.root, ignore_errors=True)
+        shutil.rmtree(work.root, ignore_errors=True)
     tell(options, report, output)
     if not options.quiet and not options.json:
         seconds = time.perf_counter() - begun

@@ -243,6 +243,7 @@ def read_drive(
         undecodable = dict(bag.undecodable)
         if topics.odom_type == TF_MESSAGE and not spans.odometry:
             lookup.moving = bag.moving_frames(topics.odom_topic)
+        damage = bag.truncated
         warnings = [*topics.notes(), *bag.repeated.notes(topics.range_topics, _choosing)]
         warnings += _warnings(bag, associator, lookup)
     if not len(associator.buffer):
@@ -251,7 +252,9 @@ def read_drive(
             raise InputError(
                 f'{path} has no reading in the part {part}; its messages span {(last - first) / 1e9:.1f} s'
             )
-        raise _nothing_associated(associator, lookup, spans, undecodable, poses)
+        error = _nothing_associated(associator, lookup, spans, undecodable, poses)
+        # the rest of the messages may be in the part that cannot be read
+        raise type(error)(f'{error}. {damage}') if damage else error
     first, last = associator.buffer.stamps
     source = {
         'bag': readable(path),

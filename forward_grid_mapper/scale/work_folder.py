@@ -1,6 +1,7 @@
 """The folder of a job: all data that workers exchange, in files that are complete or do not exist.
 
 manifest.json                                   description of the job; the folder of another job is refused
+lock                                            locked while a command works in the folder
 drives/0007.json                                data of a drive, once it is placed
 readings/row=3/column=-1/drive_0007.parquet     readings of a drive that touch a tile or come near it
 ground/row=3/column=-1/drive_0007.parquet       cells of a tile that the drive traversed
@@ -14,6 +15,8 @@ need not be made again: tasks check for it first.
 from __future__ import annotations
 
 import contextlib
+import errno
+import fcntl
 import io
 import json
 import os
@@ -96,8 +99,49 @@ class WorkFolder:
         write_json(self.manifest, described)
         return False
 
+    @contextlib.contextmanager
+    def held(self) -> Iterator[None]:
+        """Lock the folder, after `begin`, for a block: another command would remove it while this one works in it.
+
+        Raises
+        ------
+        OutputError
+            If another command works in it.
+        """
+        path = self.root / 'lock'
+        try:
+            file = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o644)
+        except FileNotFoundError:  # the other command has removed it since `begin`
+            raise OutputError(self._in_use()) from None
+        except OSError as error:
+            raise OutputError(f'{path} cannot be written: {error.strerror}') from error
+        try:
+            try:
+                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except BlockingIOError:
+                raise OutputError(self._in_use()) from None
+            except OSError as error:
+                # some network file systems have no locks
+                if error.errno not in _NO_LOCKS:
+                    raise OutputError(f'{path} cannot be locked: {error.strerror}') from error
+            if not (path.exists() and os.path.samestat(path.stat(), os.fstat(file))):
+                raise OutputError(self._in_use())
+            yield
+        finally:
+            os.close(file)
+            # NFS keeps a removed file, and so its folder, until it is closed
+            with contextlib.suppress(OSError):
+                self.root.rmdir()
+
+    def _in_use(self) -> str:
+        return (
+            f'another process_bag works in {self.path}; wait until it has ended, or choose another folder with -o or '
+            '--work'
+        )
+
 
 PARTIAL = '.partial'
+_NO_LOCKS = {errno.ENOLCK, errno.ENOSYS, errno.EOPNOTSUPP}
 
 
 @contextlib.contextmanager

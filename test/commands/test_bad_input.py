@@ -187,6 +187,17 @@ def test_drive_without_any_sensor_pose_is_rejected(tmp_path: Path, capsys: pytes
     assert 'of a split bag the first file has it, so give the whole folder' in error
 
 
+def test_drive_whose_sensor_poses_are_in_a_missing_file_names_that_file(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    bag = tmp_path / 'bag'
+    write_tape(bag, tape()._replace(extrinsics=()))
+    metadata = bag / 'metadata.yaml'
+    metadata.write_text(metadata.read_text().replace('- bag.mcap', '- bag_0.mcap\n  - bag.mcap', 1))
+    error = error_of(capsys, tmp_path, bag, '-o', tmp_path / 'maps')
+    assert 'no /tf_static' in error and 'bag_0.mcap is missing' in error
+
+
 def test_drive_without_sensor_poses_that_ends_with_ranges_is_rejected(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

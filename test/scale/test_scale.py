@@ -507,6 +507,42 @@ def test_work_folder_belongs_to_one_job(tmp_path: Path) -> None:
     assert [path.name for path in (tmp_path / 'other').iterdir()] == ['file']
 
 
+def test_work_folder_is_used_by_one_command_at_a_time(tmp_path: Path) -> None:
+    work, same = WorkFolder(str(tmp_path / 'work')), WorkFolder(str(tmp_path / 'work'))
+    work.begin({'tiles': 5.0})
+    with work.held():
+        assert same.begin({'tiles': 5.0})
+        with pytest.raises(OutputError, match=r'another process_bag works in .*work; wait .*--work'), same.held():
+            pass
+        assert same.manifest.exists()
+    with same.held():
+        shutil.rmtree(same.root)
+    with pytest.raises(OutputError, match='another process_bag works in'), work.held():
+        pass
+    assert not work.root.exists()
+
+
+@scaled
+def test_second_command_leaves_the_work_of_the_first(
+    drives: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Before a drive is placed, a command that ends without results removes its own work folder."""
+    from forward_grid_mapper.scale import cluster
+
+    work, codes = tmp_path / 'work', []
+
+    def start_again(*_: object) -> None:
+        codes.append(code_of(drives, '-o', tmp_path / 'second', '--workers', 1, '--work', work))
+        assert (work / 'manifest.json').exists()
+        raise ClusterError('no worker')
+
+    monkeypatch.setattr(cluster, 'Cluster', start_again)
+    assert code_of(drives, '-o', tmp_path / 'first', '--workers', 1, '--work', work) == 1
+    assert codes == [1]
+    assert 'another process_bag works in' in capsys.readouterr().err
+    assert not list(tmp_path.iterdir())
+
+
 def test_worker_uses_the_plan_of_the_next_job(tmp_path: Path) -> None:
     work = WorkFolder(str(tmp_path))
     for name, width in (('left', 30), ('right', 50)):
