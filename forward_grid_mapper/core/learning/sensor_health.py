@@ -9,8 +9,9 @@ Fractions of the readings of a sensor, given the maximum likelihood map:
     same      echoes within the most frequent 0.2 m of range, independent of the map
 
 A sensor that detects its own robot repeats one range, and the map may even explain it. So if a sensor repeats a range
-of less than half of the usual one of the others, a live map of the other sensors is used as well: an echo from where
-this is free is short, too.
+of less than half of the usual one of the others, live maps of the other sensors are used as well: an echo from where
+these are free is short, too. An echo is compared only with readings in its direction: along a corridor of smooth walls,
+the sensors at its sides hear the walls at one range all the time, while all others, at a slant, get no echo of them.
 
 Fractions are compared with those of the other sensors, since all have no echoes in a hall of smooth walls, and all have
 random ones in a crowd. A fraction is suspect if it is large *and* well above the median of the others.
@@ -27,6 +28,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..common.readings import Floats, Readings
+from ..maps.log_odds_kernel import direction_of_yaw
 from ..maps.log_odds_map import LogOddsMap
 from ..maps.map_set import MapSet
 from ..runtime.jit import kernel
@@ -224,21 +226,24 @@ def health_of_counts(names: tuple[str, ...], counts: Mapping[str, NDArray[np.int
 
 
 def _from_free_space(maps: MapSet, sensor: int) -> NDArray[np.bool_]:
-    """Return which echoes of a sensor come from where the live map of the other sensors is free, shape (N,)."""
+    """Return which echoes of a sensor come from where the others, in that direction, have free space, shape (N,)."""
     readings = maps.readings
     mine = (readings.sensor == sensor) & readings.echo
-    live = LogOddsMap(maps.parameters)
-    live.add(readings.select(readings.sensor != sensor))
-    chosen = readings.select(mine)
-    rows, columns = live.grid.cells_of(
-        chosen.x + chosen.z * np.cos(chosen.yaw), chosen.y + chosen.z * np.sin(chosen.yaw)
-    )
-    inside = (rows >= 0) & (rows < live.grid.height) & (columns >= 0) & (columns < live.grid.width)
-    probability = live.probability()
+    count = maps.parameters.live.live_directions
+    directions = np.array([direction_of_yaw(yaw, count) for yaw in readings.yaw.tolist()])
     free = np.zeros(len(readings), bool)
-    there = np.flatnonzero(mine)[inside]
-    # NaN, where the others have no readings, is not free
-    free[there] = probability[rows[inside], columns[inside]] < FREE
+    for direction in np.unique(directions[mine]):
+        alike = directions == direction
+        live = LogOddsMap(maps.parameters)
+        live.add(readings.select(alike & (readings.sensor != sensor)))
+        numbers = np.flatnonzero(alike & mine)
+        chosen = readings.select(numbers)
+        rows, columns = live.grid.cells_of(
+            chosen.x + chosen.z * np.cos(chosen.yaw), chosen.y + chosen.z * np.sin(chosen.yaw)
+        )
+        inside = (rows >= 0) & (rows < live.grid.height) & (columns >= 0) & (columns < live.grid.width)
+        # NaN, where the others have no readings, is not free
+        free[numbers[inside]] = live.probability()[rows[inside], columns[inside]] < FREE
     return free
 
 

@@ -84,6 +84,27 @@ def test_correct_sensors_are_ok() -> None:
     assert all(row.random < 0.2 for row in table.values())
 
 
+@pytest.mark.parametrize('heading', [0.0, 0.2, 2.0])
+def test_sensors_beside_smooth_walls_are_not_short(heading: float) -> None:
+    """They hear the walls of a corridor at one range all the time; those that look ahead never do."""
+    yaw = np.radians([-90.0, -25.0, 25.0, 90.0])
+    along, sensor = (v.ravel() for v in np.meshgrid(np.arange(0.0, 20.0, 0.1), np.arange(4), indexing='ij'))
+    readings = Readings.from_columns(
+        names=('right', 'front_right', 'front_left', 'left'),
+        x=along * math.cos(heading),
+        y=along * math.sin(heading),
+        yaw=heading + yaw[sensor],
+        # the far end of the corridor comes near at last
+        z=np.where(np.abs(yaw[sensor]) > 1.0, 0.86, np.where(along > 18.0, 22.0 - along, 4.0)),
+        z_max=np.full(len(along), 4.0),
+        half_angle=np.full(len(along), 0.17),
+        sensor=sensor,
+    )
+    table = sensor_health(mapped(readings))
+    assert {row.verdict for row in table.values()} == {'ok'}
+    assert table['left'].same == table['right'].same == 1.0
+
+
 def test_smooth_walls_and_a_follower_give_no_warning() -> None:
     table = sensor_health(mapped(corridor_drive(0).readings))
     assert health_warning(table) == ''
