@@ -43,7 +43,7 @@ from .scans import FEWEST_ON_MAP, Scans
 from .solving import LEAST_YAW, NOISE_FACTOR
 from .tail import Tail, continued, edges_from, from_step, window_coordinate
 from .wall_distances import Distances
-from .walls import wall_votes
+from .walls import DIRECTIONS, votes_for, wall_votes
 from .windows import Odometry, Windows, cut
 
 SETTLED, LONGEST, SHIFT = 12, 44, 8
@@ -319,11 +319,8 @@ class Follower:
 def direction_of_walls(windows: Windows, nodes: Floats) -> float:
     """Return the direction of walls in the frame of the nodes, shape (K, 3), radians modulo a right angle."""
     at, votes = wall_votes(windows, np.zeros(len(windows), np.bool_))
-    count = votes.shape[1]
-    degrees, ends = np.arange(count), np.column_stack([votes, votes[:, :1]])
-    seen = (degrees - np.degrees(nodes[at, 2])[:, None]) % count
-    rows = [np.interp(place, np.arange(count + 1), row) for place, row in zip(seen, ends, strict=True)]
-    direction = math.radians(float(np.sum(rows, axis=0).argmax()))
+    rows = votes_for(votes, np.arange(DIRECTIONS) - np.degrees(nodes[at, 2])[:, None])
+    direction = math.radians(float(rows.sum(0).argmax()))
     off, sure = yaws_of_votes(votes, nodes[at, 2] - direction, np.zeros(len(at)))
     return direction - float((off * sure).sum() / max(sure.sum(), 1e-9))
 
