@@ -28,7 +28,7 @@ from .updates import add_multiplicity, evaluate_all, evaluate_flipped
 MOST_UNUSED = 0.25
 """Fraction of the allocated words that may be unused before all pairs are packed again."""
 
-NOBODY = np.zeros(0, np.int64)
+NO_INDICES = np.zeros(0, np.int64)
 
 
 class Evidence(IndexedReadings):
@@ -119,7 +119,7 @@ class Evidence(IndexedReadings):
         maps = self.state.maps
         return np.where(maps.seen > 0, maps.occupied.astype(np.int8), np.int8(UNKNOWN)).reshape(self.grid.shape)
 
-    def extend(self, readings: Readings, again: NDArray[np.int64] = NOBODY) -> None:
+    def extend(self, readings: Readings, again: NDArray[np.int64] = NO_INDICES) -> None:
         """Add readings; if it fails, none is added.
 
         Parameters
