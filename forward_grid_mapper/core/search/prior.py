@@ -25,6 +25,7 @@ from ..evidence.neighbourhood import NEIGHBOURS, continues, offset, opposite, pa
 from ..runtime.jit import allocating_kernel, inlined_kernel
 from ..sensor.cone_table import Floats
 
+
 class Prior(NamedTuple):
     """Log prior odds.
 
