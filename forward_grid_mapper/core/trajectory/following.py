@@ -33,7 +33,8 @@ from .judging import MOST_WORSE
 from .jumps import jumps, since_jump
 from .likelihood import scores
 from .local_map import at_poses, for_matching, local_map
-from .matching import grid_around, measure
+from .loops import GOOD
+from .matching import climbed, grid_around, measure
 from .odometry_model import CALIBRATION, Noise, calibrated, covariances, motions
 from .passes import BEHIND, BLOCK
 from .pose_graph import Edges, Graph, Yaws, joined, no_edges, no_walls, solve
@@ -71,12 +72,8 @@ REACH, STEPS = np.array([0.6, 0.6, math.radians(7.5)]), (0.2, 0.2, math.radians(
 SIGMAS = 2.5
 """`REACH` in σ of the prior."""
 
-EVALUATED, MEASURED, CLIMBS = 60, 100, 3
-"""Readings that are evaluated in the search, and to measure the best pose; times that this is moved to the top of a
-parabola."""
-
-GOOD = 0.65
-"""Least score of a loop closure, as a fraction of the usual score of its readings."""
+EVALUATED, MEASURED = 60, 100
+"""Readings that are evaluated in the search, and to measure the best pose."""
 
 JUDGED = 12
 """Most blocks of the judgement: 20 m."""
@@ -259,8 +256,7 @@ class Follower:
         values = scores(joint, around, poses, max(len(joint.readings) // EVALUATED, 1))
         off = relative(at, poses) * SIGMAS / REACH
         best = poses[int((values - 0.5 * (off**2).sum(1)).argmax())]
-        for _ in range(CLIMBS):
-            best = measure(joint, around, best, MEASURED).pose
+        best = climbed(joint, around, best, MEASURED)
         match = measure(joint, around, best, MEASURED)
         if match.score < GOOD * self._score / self._scored * len(joint.readings):
             return no_edges()
