@@ -61,7 +61,8 @@ def main() -> None:
                 readings = random_readings(np.random.default_rng(seed), grid, options.readings)
                 evidence = Evidence(grid, model)
                 evidence.extend(readings)
-                cells = Search(evidence, SearchParameters(prior=prior, **INDEPENDENT)).run().occupied
+                Search(evidence, SearchParameters(prior=prior, **INDEPENDENT)).run()
+                cells = evidence.state.maps.occupied
                 ours = log_likelihood(readings, grid, cells.reshape(grid.shape), model) + logit * int(cells.sum())
                 short.append(best_of_all(readings, grid, model, logit) - ours)
             reached = np.mean(np.array(short) < 1e-3)

@@ -428,7 +428,7 @@ def in_line_of_sight(grid: Grid, occupied: np.ndarray, apex: tuple[float, float]
 
 
 def explained_echoes(readings: Readings, grid: Grid, occupied: np.ndarray, model: ModelParameters) -> np.ndarray:
-    """Echoes explained by occupied cells, with free path and all, shape (2, cells): the twin of `free_ways`."""
+    """Echoes explained by occupied cells, in line of sight and all, shape (2, cells): the twin of `line_of_sight`."""
     out = np.zeros((2, grid.size))
     for t in np.flatnonzero(readings.z < readings.z_max):
         sigma = sigma_of(readings, t, grid, model)
@@ -444,7 +444,7 @@ def explained_echoes(readings: Readings, grid: Grid, occupied: np.ndarray, model
 def mirror_images(
     readings: Readings, grid: Grid, occupied: np.ndarray, model: ModelParameters, cells: np.ndarray
 ) -> np.ndarray:
-    """The cells among `cells` that are mirror images, shape `grid.shape`: the twin of `free_ways`."""
+    """The cells among `cells` that are mirror images, shape `grid.shape`: the twin of `line_of_sight`."""
     free, total = explained_echoes(readings, grid, occupied, model).reshape(2, *grid.shape)
     out, n = np.zeros(grid.shape, bool), round(IMAGE_AROUND / grid.resolution)
     for row, column in np.argwhere(cells):
@@ -456,7 +456,7 @@ def mirror_images(
 def never_passed(
     readings: Readings, grid: Grid, occupied: np.ndarray, model: ModelParameters, cells: np.ndarray
 ) -> np.ndarray:
-    """The cells among `cells` that no reading passed on a free path, shape `grid.shape`: the twin of `free_ways`."""
+    """Those `cells` that no reading passed in line of sight, shape `grid.shape`: the twin of `line_of_sight`."""
     out = cells.copy()
     for t in range(len(readings)):
         sigma = sigma_of(readings, t, grid, model)

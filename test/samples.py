@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Mapping
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -14,7 +14,8 @@ from forward_grid_mapper.core.common.parameters import Parameters
 from forward_grid_mapper.core.common.readings import Readings
 from forward_grid_mapper.core.messages.message_types import OdometryMessage, Pose2, RangeMessage
 from forward_grid_mapper.core.messages.pose_association import PoseAssociator
-from forward_grid_mapper.core.search.search import Search
+from forward_grid_mapper.core.search.prior import Prior
+from forward_grid_mapper.core.search.search import Progress, Search
 
 PLAIN_MODEL: dict[str, Any] = {
     'max_incidence_angle': math.pi / 2,
@@ -39,6 +40,24 @@ def plain_model(**values: Any) -> ModelParameters:
 
 def plain_search(**values: Any) -> SearchParameters:
     return SearchParameters(**{**PLAIN_SEARCH, **values})
+
+
+class Found(NamedTuple):
+    """The map that a search found, the evidence of its cells, and data about the search."""
+
+    occupied: np.ndarray
+    evidence: np.ndarray
+    prior: Prior
+    log_prior: float
+    progress: Progress
+    converged: bool
+
+
+def found_by(search: Search, how: str = 'run', **arguments: Any) -> Found:
+    """The result of `run`, or of another method of the search."""
+    result, evidence = getattr(search, how)(**arguments), search.evidence
+    occupied = evidence.state.maps.occupied
+    return Found(occupied, evidence.of_occupancy(), *(getattr(result, name) for name in Found._fields[2:]))
 
 
 class FlipsAlone(Search):

@@ -17,7 +17,7 @@ from .common.readings import Readings, in_canonical_order
 from .evidence.evidence import Evidence
 from .evidence.neighbourhood import patterns
 from .maps.dynamic import dynamic_echoes
-from .maps.handed_out import HandedOut, hand_out
+from .maps.final_maps import FinalMaps, final_maps
 from .maps.log_odds_map import LogOddsMap, map_grid
 from .maps.map_set import MapSet
 from .maps.traversed import traversed_cells
@@ -121,7 +121,7 @@ class Mapper:
         evidence = self._index(given, start)
         try:
             found = self._search(given, evidence)
-            final = self._hand_out(given, evidence)
+            final = self._final_maps(given, evidence)
             return self._evaluate(given, evidence, found, live, final)
         finally:
             # it may take gigabytes, and callers may keep this object
@@ -155,8 +155,8 @@ class Mapper:
         return live.probability(given.grid)
 
     @_stage('post-processing')
-    def _hand_out(self, given: _Given, evidence: Evidence) -> HandedOut:
-        return hand_out(evidence, self._parameters.search, given.traversed)
+    def _final_maps(self, given: _Given, evidence: Evidence) -> FinalMaps:
+        return final_maps(evidence, self._parameters.search, given.traversed)
 
     @_stage('uncertainty')
     def _evaluate(
@@ -165,7 +165,7 @@ class Mapper:
         evidence: Evidence,
         found: SearchResult,
         live: NDArray[np.float32],
-        final: HandedOut,
+        final: FinalMaps,
     ) -> MapSet:
         """Return the maps, with the likelihoods of the readings on them."""
         ml, p, prior = final.ml, self._parameters, found.prior

@@ -25,7 +25,7 @@ from .common.grid import Grid, Window, part_of, united
 from .common.parameters import Parameters
 from .common.readings import Readings, of_drives
 from .evidence.evidence import Evidence
-from .maps.handed_out import hand_out
+from .maps.final_maps import final_maps
 from .maps.log_odds_map import map_grid
 from .maps.traversed import LONGEST_STEP, STRIDES, longest_step, mark_traversed
 from .runtime.memory import memory_for_pairs
@@ -360,5 +360,5 @@ class OnlineMap:
             return self.grid, np.zeros((0, 0), np.int8), np.zeros((0, 0), np.float32)
         evidence, search = self._evidence, self._parameters.search
         window = evidence.grid.window(self.grid)
-        final = hand_out(evidence, search, self._traversed)
+        final = final_maps(evidence, search, self._traversed)
         return self.grid, final.ml[window], final.uncertainty[window]

@@ -18,7 +18,7 @@ from forward_grid_mapper.core.common.grid import Grid
 from forward_grid_mapper.core.common.parameters import Parameters
 from forward_grid_mapper.core.common.readings import Readings
 from forward_grid_mapper.core.mapping import Mapper
-from forward_grid_mapper.core.maps import handed_out
+from forward_grid_mapper.core.maps import final_maps
 from forward_grid_mapper.core.maps.map_set import MapSet
 from forward_grid_mapper.core.maps.traversed import traversed_cells
 from forward_grid_mapper.core.search.prior import wall_prior
@@ -158,7 +158,7 @@ def test_objective_is_tempered_likelihood_and_prior_of_the_found_map(
     exponent: float, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     # the map before walls are extended and unknown cells are determined; the likelihood is that of whole cones
-    monkeypatch.setattr(handed_out, 'EXTENSION', 0.0)
+    monkeypatch.setattr(final_maps, 'EXTENSION', 0.0)
     whole = {**PLAIN_MODEL, 'least_passed': 0.0, 'likelihood_exponent': exponent}
     maps = run(some(), **whole)
     likelihood = log_likelihood(maps.readings, maps.grid, maps.ml, maps.parameters.model)

@@ -32,7 +32,7 @@ from forward_grid_mapper.core.sensor.density import CUT
 from forward_grid_mapper.core.sensor.forward_model import ForwardModel, expectations, log_likelihood
 from forward_grid_mapper.simulation.drive import corridor_drive, door_drive
 from forward_grid_mapper.simulation.sonar import NOISY
-from samples import PLAIN, FlipsAlone, plain_model, plain_search, random_readings
+from samples import PLAIN, FlipsAlone, found_by, plain_model, plain_search, random_readings
 
 LINE = Grid(0.1, 0, 0, 12, 1)
 """One row of cells; cell c is 0.05 + 0.1 c metres in front of a sensor at the origin."""
@@ -88,7 +88,7 @@ def search(
 
 def found(*arguments: object, **options: object) -> list[int]:
     """The occupied cells of the map found by the search."""
-    return np.flatnonzero(search(*arguments, **options).run().occupied).tolist()
+    return np.flatnonzero(found_by(search(*arguments, **options)).occupied).tolist()
 
 
 def gain_of(cell: int, readings: Readings, occupied: np.ndarray, model: ModelParameters = PAPER) -> float:
@@ -249,7 +249,7 @@ def descend(cost: Callable[[np.ndarray], float], occupied: np.ndarray) -> np.nda
 def test_minimising_eq_40_alone_empties_the_map(seed: int) -> None:
     grid = Grid(0.1, 0, 0, 4, 3)
     readings = random_readings(np.random.default_rng(seed), grid, 25)
-    ours = search(readings, grid).run().occupied.reshape(grid.shape)
+    ours = found_by(search(readings, grid)).occupied.reshape(grid.shape)
     assert ours.any()
     assert squares(readings, grid, ours, PAPER) > 0
     assert min(squares(readings, grid, m, PAPER) for m in every_map(grid)) == 0
@@ -289,14 +289,14 @@ def test_stale_expectations_reject_a_flip_that_the_exact_e_step_takes(
 
 def test_evidence_is_positive_at_the_echo_and_negative_in_front_of_it() -> None:
     for start in (line(), line(2), line(5)):
-        actual = search(along(0.55, 0.55, 0.55), start=start, prior=0.2).run().evidence
+        actual = found_by(search(along(0.55, 0.55, 0.55), start=start, prior=0.2)).evidence
         assert actual[5] > 5
         assert actual[:4].max() < -2
 
 
 def test_unseen_cells_stay_unchanged_although_table_2_fills_them() -> None:
     readings = along(0.35, 0.35)
-    result = search(readings, start=line(9), prior=0.2).run()
+    result = found_by(search(readings, start=line(9), prior=0.2))
     assert (result.evidence >= 0)[7:].all(), 'which Table 2 takes for occupied'
     assert np.flatnonzero(result.occupied).tolist() == [3, 9]
     assert found(readings, prior=0.2) == [3]
@@ -372,7 +372,7 @@ def test_search_starts_from_the_empty_map_since_unseen_cells_stay() -> None:
     recording = door_drive(1, NOISY, seed=0)
     readings, grid = recording.readings, recording.world.grid
     assert not search(readings, grid).evidence.state.maps.occupied.any()
-    empty, full = (search(readings, grid, start=start).run() for start in (None, np.ones(grid.shape, np.uint8)))
+    empty, full = (found_by(search(readings, grid, start=start)) for start in (None, np.ones(grid.shape, np.uint8)))
     heights = [log_likelihood(readings, grid, end.occupied.reshape(grid.shape), PAPER) for end in (empty, full)]
     assert heights[0] == pytest.approx(heights[1], abs=0.01 * abs(heights[0])), 'it finds its way from either'
     assert full.progress.flips > 3 * empty.progress.flips
@@ -387,7 +387,7 @@ def test_search_starts_from_the_empty_map_since_unseen_cells_stay() -> None:
 
 def test_mixed_marginal_is_that_of_eq_42_to_45_with_one_prior() -> None:
     readings = along(0.55, 0.62, 0.35, 1.1)
-    result = search(readings, prior=0.3).run()
+    result = found_by(search(readings, prior=0.3))
     occupied = result.occupied.reshape(LINE.shape)
     alpha, prior = 0.6, 0.2
     q = marginals(result.evidence, plain_search(alpha=alpha, prior=prior))
@@ -429,7 +429,7 @@ def test_eq_26_alone_gives_no_evidence_in_front_of_an_obstacle() -> None:
     alone = given_likeliest_cause(readings, flipped(occupied, 2), distances)
     alone -= given_likeliest_cause(readings, occupied, distances)
     assert alone == pytest.approx(0.0)
-    summed = search(readings, start=occupied).run().evidence[2]
+    summed = found_by(search(readings, start=occupied)).evidence[2]
     assert summed == pytest.approx(5 * math.log(1 - PAPER.p_hit), abs=0.2)
     q = marginals(np.array([alone, summed]), plain_search(alpha=1.0, prior=0.5))
     assert q[0] == pytest.approx(0.5)

@@ -28,7 +28,7 @@ from .updates import add_multiplicity, evaluate_all, evaluate_flipped
 MOST_UNUSED = 0.25
 """Fraction of the allocated words that may be unused before all pairs are packed again."""
 
-NOBODY = np.zeros(0, np.int64)
+NO_INDICES = np.zeros(0, np.int64)
 
 
 class Evidence(IndexedReadings):
@@ -88,20 +88,22 @@ class Evidence(IndexedReadings):
     @property
     def log_likelihood(self) -> float:
         """Log p(Z | m) in nats."""
-        reading_states = self.state.reading_states[: self._size]
-        return float((reading_states['likelihood'].astype(np.int64) * reading_states['multiplicity']).sum() * QUANTUM)
+        return float(self._log_likelihoods().sum() * QUANTUM)
 
     @property
     def log_likelihoods(self) -> Floats:
         """Log p(z | m) of each reading, times its multiplicity, shape (N,), nats."""
-        s = self.state.reading_states[: self._size]
-        out: Floats = s['likelihood'].astype(np.int64) * s['multiplicity'] * QUANTUM
-        return out
+        return np.asarray(self._log_likelihoods() * QUANTUM, np.float64)
 
     def log_likelihood_of(self, which: NDArray[np.bool_]) -> float:
         """Return the log-likelihood of the readings in a mask, shape (N,), nats; sums of subsets are exact."""
-        reading_states = self.state.reading_states[: self._size][which]
-        return float((reading_states['likelihood'].astype(np.int64) * reading_states['multiplicity']).sum() * QUANTUM)
+        return float(self._log_likelihoods()[which].sum() * QUANTUM)
+
+    def _log_likelihoods(self) -> NDArray[np.int64]:
+        """Return `log_likelihoods` in units of QUANTUM, whose sums are exact."""
+        states = self.state.reading_states[: self._size]
+        out: NDArray[np.int64] = states['likelihood'].astype(np.int64) * states['multiplicity']
+        return out
 
     def of_occupancy(self) -> Floats:
         """Return γ [log p(Z | cell occupied, rest of the map) − log p(Z | cell free, rest of the map)], nats.
@@ -117,7 +119,7 @@ class Evidence(IndexedReadings):
         maps = self.state.maps
         return np.where(maps.seen > 0, maps.occupied.astype(np.int8), np.int8(UNKNOWN)).reshape(self.grid.shape)
 
-    def extend(self, readings: Readings, again: NDArray[np.int64] = NOBODY) -> None:
+    def extend(self, readings: Readings, again: NDArray[np.int64] = NO_INDICES) -> None:
         """Add readings; if it fails, none is added.
 
         Parameters

@@ -21,6 +21,21 @@ DX = (1, 1, 0, -1, -1, -1, 0, 1)
 DY = (0, 1, 1, 1, 0, -1, -1, -1)
 """Rows from a cell to each neighbour."""
 
+OPPOSITE_ENOUGH = 3
+"""Least angle between two neighbours of a cell inside a curve, eighths of a turn: 135°, so that a curve on the lattice
+may have any direction, but no corner."""
+
+
+def occupied_of(pattern: int) -> list[int]:
+    """Return the neighbours that are occupied in a pattern, in increasing order."""
+    return [k for k in range(NEIGHBOURS) if pattern >> k & 1]
+
+
+def continues(pattern: int) -> bool:
+    """Return whether a curve continues through a cell: two of its neighbours are on opposite sides."""
+    bits = occupied_of(pattern)
+    return any(min((a - b) % NEIGHBOURS, (b - a) % NEIGHBOURS) >= OPPOSITE_ENOUGH for a in bits for b in bits)
+
 
 @inlined_kernel
 def offset(k: int, width: int) -> int:

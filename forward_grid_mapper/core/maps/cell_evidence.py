@@ -16,7 +16,7 @@ from ..search.prior import odds_given_neighbours, wall_prior
 from ..sensor.cone_table import cone_table
 from ..sensor.forward_model import ForwardModel
 from ..sensor.surface_normals import SurfaceNormals
-from .free_ways import in_line_of_sight
+from .line_of_sight import in_line_of_sight
 from .traversed import traversed_cells
 
 NOTHING = 1e-9

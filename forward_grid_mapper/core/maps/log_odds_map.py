@@ -4,16 +4,17 @@ Inverse sensor model. A reading adds the following to the cells of its cone, tim
 (`cone.strength`), so that cells at the edge get little. With d the distance of a cell, b and a the depths of the arc of
 an echo before and behind its range z, and w the length of that arc from edge to edge of the cone:
 
-    d < z − b             logit(live_p_free), or logit(live_p_free_no_echo) for a reading without echo
-    z − b ≤ d ≤ z + a     logit(live_p_occupied) · min(1, live_echo_width / w); nothing for a reading without echo
+    echo        d < z − b             logit(live_p_free)
+                z − b ≤ d ≤ z + a     logit(live_p_occupied) · min(1, live_echo_width / w)
+    no echo     d ≤ z                 logit(live_p_free_no_echo)
 
 Only one point of the arc returned the echo, so each of its cells gets less if it is longer.
 
 Directions. A smooth wall returns only sound that meets it nearly at right angles; at a slant, readings appear to pass
 through it, however many there are. So readings are summed separately for each of `live_directions`, evenly spaced over
-half a turn. The log-odds of a cell are the largest of any direction, with a fraction of those of the two neighbouring
-directions; if none is positive, they are the sum of all readings. With one direction this is the map of the paper,
-(14).
+half a turn. The log-odds of a direction get a fraction of those of the two neighbouring ones. Those of a cell are the
+sum of all readings, or those of the direction with the most, if these are positive and larger. With one direction this
+is the map of the paper, (14).
 
 Increments are rounded to 2⁻²⁰, so that float64 sums of them are exact. So the map does not depend on the order of the
 readings, and that of the node equals that of the offline tool in each cell.

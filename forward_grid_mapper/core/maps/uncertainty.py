@@ -32,7 +32,7 @@ from numpy.typing import NDArray
 
 from ..common.constants import LEAST_EVIDENCE, LEAST_NOTICING
 from ..common.parameter_groups import SearchParameters
-from ..evidence.neighbourhood import patterns
+from ..evidence.neighbourhood import continues, occupied_of, patterns
 from ..sensor.cone_table import Floats
 from .free_space import Passes
 
@@ -51,9 +51,9 @@ mean."""
 
 def kind_of(pattern: int) -> float:
     """Return the log odds of a cell by the pattern of its occupied neighbours, nats."""
-    bits = [k for k in range(8) if pattern >> k & 1]
+    bits = occupied_of(pattern)
     sides = sum(k % 2 == 0 for k in bits)
-    if any(min((a - b) % 8, (b - a) % 8) >= 3 for a in bits for b in bits):
+    if continues(pattern):
         return HOLE if sides >= 3 else INSIDE
     if any(k % 2 == 0 and (k + 2) % 8 in bits for k in bits):
         return STEP

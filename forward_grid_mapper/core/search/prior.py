@@ -21,13 +21,9 @@ from numpy.typing import NDArray
 
 from ..common.constants import FORBIDDEN
 from ..common.parameter_groups import SearchParameters
-from ..evidence.neighbourhood import NEIGHBOURS, offset, opposite, patterns
+from ..evidence.neighbourhood import NEIGHBOURS, continues, offset, opposite, patterns
 from ..runtime.jit import allocating_kernel, inlined_kernel
 from ..sensor.cone_table import Floats
-
-OPPOSITE_ENOUGH = 3
-"""Least angle between two neighbours of a cell inside a curve, eighths of a turn: 135°, so that a curve on the lattice
-may have any direction, but no corner."""
 
 
 class Prior(NamedTuple):
@@ -86,8 +82,7 @@ def _ends() -> Floats:
     out = np.ones(256)
     out[0] = 2.0
     for pattern in range(1, 256):
-        bits = [k for k in range(8) if pattern >> k & 1]
-        if any(min((a - b) % 8, (b - a) % 8) >= OPPOSITE_ENOUGH for a in bits for b in bits):
+        if continues(pattern):
             out[pattern] = 0.0
     return out
 

@@ -72,14 +72,10 @@ class Progress:
 
 @dataclass(frozen=True)
 class SearchResult:
-    """The map that was found, and data about the search.
+    """Data about a search, whose map is in its evidence.
 
     Attributes
     ----------
-    occupied : uint8, shape (cells,)
-        1 occupied, 0 free or in no cone.
-    evidence : float64, shape (cells,)
-        γ [log p(Z | cell occupied, rest of the map) − log p(Z | cell free, rest of the map)], nats; 0 if in no cone.
     prior : Prior
         The one that the map was found with.
     log_prior : float
@@ -89,8 +85,6 @@ class SearchResult:
         False if `max_iterations` ended the search.
     """
 
-    occupied: NDArray[np.uint8]
-    evidence: Floats
     prior: Prior
     log_prior: float
     progress: Progress
@@ -205,14 +199,8 @@ class Search:
 
     def _result(self, converged: bool) -> SearchResult:
         maps = self.evidence.state.maps
-        return SearchResult(
-            maps.occupied,
-            self.evidence.of_occupancy(),
-            self._prior,
-            log_prior(self._prior, maps.occupied, maps.pattern),
-            self.progress,
-            converged,
-        )
+        of_map = log_prior(self._prior, maps.occupied, maps.pattern)
+        return SearchResult(self._prior, of_map, self.progress, converged)
 
     def _climb(self, watch: Watch) -> bool:
         """Make moves of all kinds until nothing gains; return whether this converged."""

@@ -16,7 +16,7 @@ from ..common.readings import Readings
 from ..evidence.evidence import Evidence
 from ..evidence.learned_normals import has_limit
 from ..maps.dynamic import dynamic_echoes
-from ..maps.handed_out import hand_out
+from ..maps.final_maps import final_maps
 from ..runtime.cancelling import NEVER
 from ..runtime.memory import memory_for_pairs
 from ..search.search import Progress, Search
@@ -166,7 +166,7 @@ def finished(given: Given, parameters: Parameters) -> Finished:
     p = parameters
     evidence = _evidence(given, p)
     searched = evidence.observed()
-    ml, uncertainty = hand_out(evidence, p.search, given.traversed)
+    ml, uncertainty = final_maps(evidence, p.search, given.traversed)
     return Finished(
         given.core(ml),
         given.core(uncertainty),

@@ -33,7 +33,8 @@ from .judging import MOST_WORSE
 from .jumps import jumps, since_jump
 from .likelihood import scores
 from .local_map import at_poses, for_matching, local_map
-from .matching import grid_around, measure
+from .loops import GOOD
+from .matching import climbed, grid_around, measure
 from .odometry_model import CALIBRATION, Noise, calibrated, covariances, motions
 from .passes import BEHIND, BLOCK
 from .pose_graph import Edges, Graph, Yaws, joined, no_edges, no_walls, solve
@@ -43,7 +44,7 @@ from .scans import FEWEST_ON_MAP, Scans
 from .solving import LEAST_YAW, NOISE_FACTOR
 from .tail import Tail, continued, edges_from, from_step, window_coordinate
 from .wall_distances import Distances
-from .walls import wall_votes
+from .walls import DIRECTIONS, votes_for, wall_votes
 from .windows import Odometry, Windows, cut
 
 SETTLED, LONGEST, SHIFT = 12, 44, 8
@@ -71,12 +72,8 @@ REACH, STEPS = np.array([0.6, 0.6, math.radians(7.5)]), (0.2, 0.2, math.radians(
 SIGMAS = 2.5
 """`REACH` in σ of the prior."""
 
-EVALUATED, MEASURED, CLIMBS = 60, 100, 3
-"""Readings that are evaluated in the search, and to measure the best pose; times that this is moved to the top of a
-parabola."""
-
-GOOD = 0.65
-"""Least score of a loop closure, as a fraction of the usual score of its readings."""
+EVALUATED, MEASURED = 60, 100
+"""Readings that are evaluated in the search, and to measure the best pose."""
 
 JUDGED = 12
 """Most blocks of the judgement: 20 m."""
@@ -259,8 +256,7 @@ class Follower:
         values = scores(joint, around, poses, max(len(joint.readings) // EVALUATED, 1))
         off = relative(at, poses) * SIGMAS / REACH
         best = poses[int((values - 0.5 * (off**2).sum(1)).argmax())]
-        for _ in range(CLIMBS):
-            best = measure(joint, around, best, MEASURED).pose
+        best = climbed(joint, around, best, MEASURED)
         match = measure(joint, around, best, MEASURED)
         if match.score < GOOD * self._score / self._scored * len(joint.readings):
             return no_edges()
@@ -319,11 +315,8 @@ class Follower:
 def direction_of_walls(windows: Windows, nodes: Floats) -> float:
     """Return the direction of walls in the frame of the nodes, shape (K, 3), radians modulo a right angle."""
     at, votes = wall_votes(windows, np.zeros(len(windows), np.bool_))
-    count = votes.shape[1]
-    degrees, ends = np.arange(count), np.column_stack([votes, votes[:, :1]])
-    seen = (degrees - np.degrees(nodes[at, 2])[:, None]) % count
-    rows = [np.interp(place, np.arange(count + 1), row) for place, row in zip(seen, ends, strict=True)]
-    direction = math.radians(float(np.sum(rows, axis=0).argmax()))
+    rows = votes_for(votes, np.arange(DIRECTIONS) - np.degrees(nodes[at, 2])[:, None])
+    direction = math.radians(float(rows.sum(0).argmax()))
     off, sure = yaws_of_votes(votes, nodes[at, 2] - direction, np.zeros(len(at)))
     return direction - float((off * sure).sum() / max(sure.sum(), 1e-9))
 

@@ -28,7 +28,7 @@ from numpy.typing import NDArray
 
 from .hidden_markov import forward, smooth
 from .poses import Floats
-from .walls import DIRECTIONS
+from .walls import DIRECTIONS, votes_for
 from .windows import Windows
 
 STATES = 2 * DIRECTIONS
@@ -183,10 +183,7 @@ class _Chain:
         self.states, self._wider = around * STATES, wider
         self.grid = np.arange(self.states) * STEP
         # a wall along an axis has the direction −(yaw + δ) in the frame of the node
-        seen = np.degrees(np.array(directions)[:, None] - (yaw[:, None, None] + self.grid)) % DIRECTIONS
-        ends = np.column_stack([votes, votes[:, :1]])
-        places = np.arange(DIRECTIONS + 1)
-        rows = np.stack([np.interp(place, places, row) for place, row in zip(seen, ends, strict=True)])
+        rows = votes_for(votes, np.degrees(np.array(directions)[:, None] - (yaw[:, None, None] + self.grid)))
         self.likelihood: Floats = (UNIFORM_PART + (1.0 - UNIFORM_PART) * rows) ** temper
         self._anywhere = np.full(self.states, 1 / self.states)
         self._other = -np.expm1(-ENTERED * self.length) if len(directions) > 1 else np.zeros(len(self.length))
@@ -285,10 +282,7 @@ def _doubtful(falls: Floats) -> list[NDArray[np.int64]]:
 def yaws_of_votes(votes: Floats, yaw: Floats, correction: Floats) -> tuple[Floats, Floats]:
     """Return the correction by the votes of each place alone, near `correction`, and its information."""
     off = np.arange(-NEAR, NEAR + 1)
-    seen = np.degrees(-(yaw + correction))[:, None] - off
-    places = np.arange(DIRECTIONS + 1)
-    ends = np.column_stack([votes, votes[:, :1]])
-    rows = np.stack([np.interp(place % DIRECTIONS, places, row) for place, row in zip(seen, ends, strict=True)])
+    rows = votes_for(votes, np.degrees(-(yaw + correction))[:, None] - off)
     excess = np.maximum(rows - 1.0, 0.0)
     mass = excess.sum(1)
     mean = (excess * off).sum(1) / np.maximum(mass, 1e-9)

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .local_map import LocalMap
-from .matching import measure
+from .matching import climbed, measure
 from .passes import FEWEST, Matches, Progress
 from .poses import Floats, axes_at, compose, relative, wrapped
 from .scans import FEWEST_ON_MAP, Scans
@@ -63,9 +63,6 @@ bare corridor would count as alternatives."""
 
 LEAST_MARGIN = 12.0
 """Nats by which the best pose must be better than any alternative."""
-
-CLIMBS = 3
-"""Times that the best pose is moved to the top of a parabola fitted around it."""
 
 CANDIDATES = 2
 """Most places that a block is matched with."""
@@ -172,9 +169,7 @@ def find_loop(
     guess = relative(nodes[place], nodes[middle])
     reach = np.clip(SIGMAS * sigma, LEAST, LARGEST)
     found = search(joint, around, guess, np.maximum(sigma, LEAST / 2), reach)
-    best = found.best
-    for _ in range(CLIMBS):
-        best = measure(joint, around, best, MEASURED).pose
+    best = climbed(joint, around, found.best, MEASURED)
     final = measure(joint, around, best, MEASURED)
     count = len(joint.readings)
     if final.score < GOOD * usual * count:

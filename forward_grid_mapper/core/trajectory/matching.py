@@ -32,6 +32,9 @@ FARTHEST_TOP = 2.0
 ENOUGH = 32
 """Readings that are evaluated to measure a pose: more of a short piece of the drive add little, and take time."""
 
+CLIMBS = 3
+"""Times that the best pose of a search is moved to the top of a parabola."""
+
 COARSE = (0.1, 0.1, math.radians(2.5))
 """Steps of a search: metres ahead and aside, radians."""
 
@@ -81,6 +84,13 @@ def measure(scan: Scan, around: LocalMap, pose: Floats, most: int = ENOUGH) -> M
     # scores are scaled up to all readings, but only those evaluated give information
     information: Floats = (axes * curvature) @ axes.T / np.outer(CURVED, CURVED) / stride
     return Match(pose + top * CURVED, information, float(values[13]))
+
+
+def climbed(scan: Scan, around: LocalMap, pose: Floats, most: int) -> Floats:
+    """Return the best pose of a search, moved to the top of the parabola around it `CLIMBS` times; shape (3,)."""
+    for _ in range(CLIMBS):
+        pose = measure(scan, around, pose, most).pose
+    return pose
 
 
 def grid_around(center: Floats, reach: Floats, steps: tuple[float, float, float] = COARSE) -> Floats:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -11,7 +10,7 @@ import numpy as np
 from ..common.readings import Readings
 from .jumps import UNKNOWN, Begin, Part, jump_words
 from .local_map import at_poses
-from .poses import compose, relative
+from .poses import compose, relative, rms_after_alignment
 from .registration import moved_to
 from .windows import Odometry
 
@@ -139,10 +138,5 @@ def replaced(readings: Readings, odometry: Odometry, trajectory: Odometry) -> Re
 
 def differences(odometry: Odometry, trajectory: Odometry) -> tuple[float, float]:
     """Return the rms differences of positions, metres, and yaws, radians, of two trajectories after rigid alignment."""
-    a = odometry.pose[:, :2] - odometry.pose[:, :2].mean(0)
-    b = trajectory.pose[:, :2] - trajectory.pose[:, :2].mean(0)
-    turn = math.atan2((a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]).sum(), (a * b).sum())
-    c, s = math.cos(turn), math.sin(turn)
-    moved = float(np.sqrt(((a @ np.array([[c, s], [-s, c]]) - b) ** 2).sum(1).mean()))
-    off = trajectory.pose[:, 2] - odometry.pose[:, 2]
-    return moved, float(np.std(off))
+    turned = float(np.std(trajectory.pose[:, 2] - odometry.pose[:, 2]))
+    return rms_after_alignment(odometry.pose, trajectory.pose), turned

@@ -7,6 +7,7 @@ a to the axis. With d_ij the pose of node j in the frame of node i, the solution
     + Σ ρ(‖d_k,k+1 − (o_k + C_k c)‖²_Ω) + ‖c‖²_Ω   odometry o_k, its calibration and the prior of this
     + Σ τ((θ_k − y_k)² Ω)                          measured yaws y_k
     + Σ τ((n · x_k + z_k − w − a t_k)² Ω)          measured distances z_k to walls of normal n; t_k along the wall
+    + Σ (a / `WALL_ANGLE_SIGMA`)²                  the prior of the angles of walls
 
 where ρ(s) = k² log(1 + s / k²) is Cauchy's loss and τ(s) = s / (1 + s / k²) that of Geman and McClure, under which
 outliers, such as the direction of a wall at another angle, have almost no influence. Solved by Gauss-Newton with
@@ -182,8 +183,6 @@ class Solution:
     calibration : float64, shape (C,)
     squared : float64, shape (E,)
         Squared residual of each match, σ².
-    odometry_squared : float64, shape (K − 1,)
-        The same of odometry.
     samples : float64, shape (S, K, 3)
         Deviations of the nodes from the solution, drawn from the posterior.
     """
@@ -191,13 +190,12 @@ class Solution:
     nodes: Floats
     calibration: Floats
     squared: Floats
-    odometry_squared: Floats
     samples: Floats
 
 
 def solution_at(nodes: Floats, calibration: int) -> Solution:
     """Return nodes as a solution without residuals and samples; the calibration has so many values, all 0."""
-    return Solution(nodes, np.zeros(calibration), np.zeros(0), np.zeros(0), np.zeros((0, *nodes.shape)))
+    return Solution(nodes, np.zeros(calibration), np.zeros(0), np.zeros((0, *nodes.shape)))
 
 
 def residuals(nodes: Floats, edges: Edges) -> Floats:
@@ -364,7 +362,7 @@ def _where_walls_are(walls: Walls, nodes: Floats) -> Floats:
     return out
 
 
-def solve(graph: Graph, nodes: Floats, calibration: Floats, samples: int = 0, seed: int = 0) -> Solution:
+def solve(graph: Graph, nodes: Floats, calibration: Floats, samples: int = 0) -> Solution:
     """Return the solution of a graph.
 
     Parameters
@@ -390,6 +388,6 @@ def solve(graph: Graph, nodes: Floats, calibration: Floats, samples: int = 0, se
         if np.abs(step[: 3 * len(nodes)]).max() < LEAST_STEP:
             break
     n = len(graph.odometry.first)
-    drawn = normal.draw(samples, np.random.default_rng(seed))[: 3 * len(nodes)].T.reshape(samples, len(nodes), 3)
+    drawn = normal.draw(samples, np.random.default_rng(0))[: 3 * len(nodes)].T.reshape(samples, len(nodes), 3)
     state = normal.state
-    return Solution(state.nodes, state.calibration, normal.squared[n:], normal.squared[:n], drawn)
+    return Solution(state.nodes, state.calibration, normal.squared[n:], drawn)

@@ -195,3 +195,20 @@ def wall_votes(windows: Windows, held_out: NDArray[np.bool_]) -> tuple[NDArray[n
         return at, np.ones_like(votes)
     added = USUAL * float(np.median(mean[mean > 0.0]))
     return at, (votes + added) / (mean + added)
+
+
+def votes_for(votes: Floats, degrees: Floats) -> Floats:
+    """Return the votes of each place for directions of walls, interpolated linearly.
+
+    Parameters
+    ----------
+    votes : float64, shape (B, DIRECTIONS)
+        From `wall_votes`; B may be 0.
+    degrees : float64, shape (B, …)
+        Directions in the frame of the node, modulo 90°.
+    """
+    whole, ends = np.arange(DIRECTIONS + 1), np.column_stack([votes, votes[:, :1]])
+    out = np.empty(degrees.shape)
+    for k, (place, row) in enumerate(zip(degrees % DIRECTIONS, ends, strict=True)):
+        out[k] = np.interp(place, whole, row)
+    return out

@@ -18,8 +18,8 @@ from forward_grid_mapper.core.common.parameters import Parameters
 from forward_grid_mapper.core.evidence.evidence import Evidence
 from forward_grid_mapper.core.mapping import Mapper
 from forward_grid_mapper.core.runtime import control_groups, threads
-from forward_grid_mapper.core.search.search import Search, SearchResult
-from samples import PLAIN_MODEL, PLAIN_SEARCH, random_readings
+from forward_grid_mapper.core.search.search import Search
+from samples import PLAIN_MODEL, PLAIN_SEARCH, Found, found_by, random_readings
 
 AREA = Grid(0.1, -13, 4, 60, 50)
 
@@ -108,7 +108,7 @@ def test_number_of_cores_is_at_least_one() -> None:
     assert threads.cores() >= 1
 
 
-def search(workers: int, memory: float, seed: int, plain: bool) -> tuple[SearchResult, Evidence]:
+def search(workers: int, memory: float, seed: int, plain: bool) -> tuple[Found, Evidence]:
     readings = random_readings(np.random.default_rng(seed), AREA, 600, z_max=3.0)
     readings.half_angle[:] *= 0.3
     surfaces = PLAIN_MODEL if plain else {}
@@ -116,7 +116,7 @@ def search(workers: int, memory: float, seed: int, plain: bool) -> tuple[SearchR
     evidence = Evidence(AREA, model, memory=memory, threads=workers)
     evidence.extend(readings)
     assert evidence.state.normals.known.any() != plain
-    return Search(evidence, SearchParameters(**(PLAIN_SEARCH if plain else {}))).run(), evidence
+    return found_by(Search(evidence, SearchParameters(**(PLAIN_SEARCH if plain else {})))), evidence
 
 
 @pytest.mark.parametrize(('seed', 'plain'), [(0, True), (1, False)], ids=['plain', 'whole'])

@@ -25,7 +25,7 @@ from forward_grid_mapper.core.search.gap_closing import close_gaps, remove_short
 from forward_grid_mapper.core.search.prior import Prior, wall_prior
 from forward_grid_mapper.core.search.search import LEAST, Search
 from forward_grid_mapper.core.sensor.forward_model import log_likelihood
-from samples import plain_model, plain_search, random_readings
+from samples import found_by, plain_model, plain_search, random_readings
 
 GRID = Grid(0.1, 0, 0, 24, 14)
 MODEL = plain_model(p_hit=0.7, p_rand=0.4, p_lost=0.4, sigma=0.05)
@@ -55,7 +55,7 @@ def searched(monkeypatch: pytest.MonkeyPatch):
         monkeypatch.setattr(search_module, 'LONGEST_GAP', longest * GRID.resolution)
         evidence = Evidence(GRID, MODEL)
         evidence.extend(readings)
-        result = Search(evidence, plain_search(**{'prior': 0.4, 'wall_cost': 1.0, 'end_cost': 1.5, **values})).run()
+        result = found_by(Search(evidence, plain_search(**{'prior': 0.4, 'wall_cost': 1.0, 'end_cost': 1.5, **values})))
         return result.occupied.reshape(GRID.shape)
 
     return run
@@ -274,5 +274,5 @@ def test_short_wall_that_single_flips_keep_is_removed_as_a_whole(monkeypatch: py
         monkeypatch.setattr(search_module, 'SHORT_WALL', short)
         evidence = Evidence(GRID, MODEL)
         evidence.extend(readings)
-        found.append(Search(evidence, plain_search(prior=0.4, wall_cost=1.0, end_cost=4.0)).run().occupied.sum())
+        found.append(found_by(Search(evidence, plain_search(prior=0.4, wall_cost=1.0, end_cost=4.0))).occupied.sum())
     assert found == [3, 0]

@@ -24,7 +24,7 @@ from forward_grid_mapper.core.search.flips import gain_of
 from forward_grid_mapper.core.search.prior import Prior, independent_prior, odds_given_neighbours, wall_prior
 from forward_grid_mapper.core.search.search import FEW, LEAST, Progress, Search
 from forward_grid_mapper.core.sensor.forward_model import log_likelihood
-from samples import FlipsAlone, plain_model, plain_search, random_readings
+from samples import FlipsAlone, found_by, plain_model, plain_search, random_readings
 
 GRID = Grid(0.1, 0, 0, 12, 9)
 MODEL = plain_model(p_hit=0.6, p_rand=0.1, p_lost=0.1, sigma=0.06)
@@ -106,7 +106,7 @@ def test_objective_never_falls_and_ends_at_an_optimum(seed: int, prior: float, s
         assert progress.iterations == before.iterations + 1
         last, before = now(), progress
 
-    result = search.run(watch)
+    result = found_by(search, watch=watch)
     assert result.converged
     assert result.progress == before
     seen = maps.seen
@@ -157,7 +157,7 @@ def test_round_without_gain_is_undone(monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.mark.parametrize('seed', range(6))
 def test_at_the_end_no_shift_gains(seed: int) -> None:
     readings = random_readings(np.random.default_rng(seed), GRID, 100)
-    result = make(readings, prior=0.4).run()
+    result = found_by(make(readings, prior=0.4))
     end = objective(readings, result.occupied, MODEL, 0.4)
     for c in np.flatnonzero(result.occupied):
         row, column = divmod(int(c), GRID.width)
@@ -173,11 +173,11 @@ def test_at_the_end_no_shift_gains(seed: int) -> None:
 @pytest.mark.parametrize('grid', [GRID, AREA], ids=['small', 'large'])
 def test_turned_or_mirrored_readings_give_the_turned_or_mirrored_map(seed: int, grid: Grid) -> None:
     readings = random_readings(np.random.default_rng(seed), grid, 200, z_max=1.5)
-    plain = make(readings, grid).run()
+    plain = found_by(make(readings, grid))
     mirror = dataclasses.replace(readings, x=-readings.x, yaw=math.pi - readings.yaw)
-    mirrored = make(mirror, dataclasses.replace(grid, column=-grid.column - grid.width)).run()
+    mirrored = found_by(make(mirror, dataclasses.replace(grid, column=-grid.column - grid.width)))
     turn = dataclasses.replace(readings, x=-readings.y, y=readings.x, yaw=readings.yaw + math.pi / 2)
-    turned = make(turn, Grid(grid.resolution, -grid.row - grid.height, grid.column, grid.height, grid.width)).run()
+    turned = found_by(make(turn, Grid(grid.resolution, -grid.row - grid.height, grid.column, grid.height, grid.width)))
     for name, error in (('occupied', 0.0), ('evidence', 1e-5)):
         expected = getattr(plain, name).reshape(grid.shape)
         np.testing.assert_allclose(getattr(mirrored, name).reshape(grid.shape)[:, ::-1], expected, atol=error)
@@ -189,7 +189,8 @@ def test_shift_moves_do_not_end_lower() -> None:
     for seed in range(20):
         readings = random_readings(np.random.default_rng(seed), GRID, 120)
         ends = [
-            objective(readings, make(readings, kind=kind).run().occupied, MODEL, 0.5) for kind in (FlipsAlone, Search)
+            objective(readings, found_by(make(readings, kind=kind)).occupied, MODEL, 0.5)
+            for kind in (FlipsAlone, Search)
         ]
         gained.append(ends[1] - ends[0])
     assert min(gained) > -1e-3
@@ -200,7 +201,7 @@ def test_marginals_are_those_of_eq_43_by_brute_force() -> None:
     rng = np.random.default_rng(11)
     grid = Grid(0.1, 0, 0, 4, 4)
     readings = random_readings(rng, grid, 25)
-    result = make(readings, grid).run()
+    result = found_by(make(readings, grid))
     occupied = result.occupied.reshape(grid.shape)
     for alpha, prior in ((1.0, 0.5), (0.3, 0.2)):
         q = marginals(result.evidence, plain_search(alpha=alpha, prior=prior))
@@ -226,7 +227,7 @@ def test_search_finds_the_globally_best_map_in_most_cases(record_property: objec
     for seed in range(cases):
         readings = random_readings(np.random.default_rng(seed), grid, 12)
         best = (naive.log_likelihoods(readings, grid, maps, MODEL) + math.log(0.3 / 0.7) * maps.sum(axis=1)).max()
-        found = objective(readings, make(readings, grid, prior=0.3).run().occupied, MODEL, 0.3, grid)
+        found = objective(readings, found_by(make(readings, grid, prior=0.3)).occupied, MODEL, 0.3, grid)
         assert found <= best + 1e-9
         reached += found > best - 1e-3
         lost.append(best - found)
@@ -237,7 +238,7 @@ def test_search_finds_the_globally_best_map_in_most_cases(record_property: objec
 
 def test_evidence_of_unseen_cells_is_zero() -> None:
     readings = Readings.from_columns(x=0.05, y=0.05, yaw=0.0, z=[0.3], z_max=1.0, half_angle=0.1)
-    result = make(readings).run()
+    result = found_by(make(readings))
     assert (result.evidence.reshape(GRID.shape)[4:] == 0).all()
     assert result.occupied.reshape(GRID.shape)[0, 3] == 1
 
@@ -255,7 +256,7 @@ def test_search_of_many_equally_rounded_readings_converges() -> None:
     grid = Grid(0.1, 0, 0, 16, 1)
     for p_rand in np.linspace(0.02, 0.2, 19):
         model = plain_model(p_hit=0.05, p_rand=float(p_rand), p_lost=0.0, sigma=0.05)
-        assert make(readings, grid, model).run().converged
+        assert found_by(make(readings, grid, model)).converged
 
 
 @pytest.mark.parametrize('p_rand', [0.04, 0.11, 0.12])
@@ -274,14 +275,14 @@ def test_freed_cell_of_very_many_readings_is_not_occupied_again(p_rand: float) -
     readings, gain = gain_of_freeing(math.ceil(none / (none - one)) + 1)
     for loss in LEAST[1] * len(readings) * np.linspace(0, 1.5, 16):
         prior = 1 / (1 + math.exp(-gain - loss))
-        result = make(readings, grid, model, start=start, prior=prior, max_iterations=100).refine()
+        result = found_by(make(readings, grid, model, start=start, prior=prior, max_iterations=100), 'refine')
         assert result.converged
         assert result.progress.flips <= 1
 
 
 def test_search_can_be_cancelled_before_it_begins_and_at_each_step() -> None:
     readings = random_readings(np.random.default_rng(0), AREA, 400, z_max=2.0)
-    steps = make(readings, AREA).run().progress.iterations
+    steps = found_by(make(readings, AREA)).progress.iterations
     assert steps > 4
     for last in range(steps):
         stop = np.zeros(1, np.uint8)
@@ -299,7 +300,7 @@ def test_search_can_be_cancelled_before_it_begins_and_at_each_step() -> None:
 def test_search_of_readings_without_echo_keeps_the_empty_map() -> None:
     readings = random_readings(np.random.default_rng(0), GRID, 60)
     readings.z[:] = readings.z_max
-    result = make(readings).run()
+    result = found_by(make(readings))
     assert not result.occupied.any()
     assert result.converged
     assert result.progress.flips == 0
@@ -308,15 +309,15 @@ def test_search_of_readings_without_echo_keeps_the_empty_map() -> None:
 
 def test_search_that_starts_from_its_own_result_changes_nothing() -> None:
     readings = random_readings(np.random.default_rng(4), GRID, 100)
-    first = make(readings).run()
-    again = make(readings, start=first.occupied).run()
+    first = found_by(make(readings))
+    again = found_by(make(readings, start=first.occupied))
     assert np.array_equal(again.occupied, first.occupied)
     assert np.array_equal(again.evidence, first.evidence)
     assert (again.progress.flips, again.progress.shifts, again.progress.gain) == (0, 0, 0.0)
 
 
 def test_search_at_max_iterations_ends_and_reports_no_convergence() -> None:
-    result = make(random_readings(np.random.default_rng(0), GRID, 200), max_iterations=1).run()
+    result = found_by(make(random_readings(np.random.default_rng(0), GRID, 200), max_iterations=1))
     assert not result.converged
     assert result.progress.iterations == 1
 
@@ -324,7 +325,7 @@ def test_search_at_max_iterations_ends_and_reports_no_convergence() -> None:
 @pytest.mark.parametrize('most', [1, 2, 3, 5])
 def test_max_iterations_counts_rounds_sweeps_and_shifts(most: int) -> None:
     readings = random_readings(np.random.default_rng(0), AREA, 400, z_max=2.0)
-    result = make(readings, AREA, max_iterations=most).run()
+    result = found_by(make(readings, AREA, max_iterations=most))
     assert result.progress.iterations == most
     assert not result.converged
 
@@ -373,7 +374,7 @@ def test_with_shapes_the_objective_of_each_stage_never_falls(
         assert now(stage) - last[id(stage)] == pytest.approx(progress.gain - before.gain, abs=1e-4 + rounding)
         last, before = {id(p): now(p) for p in (plain, whole)}, progress
 
-    result = search.run(watch)
+    result = found_by(search, watch=watch)
     assert result.converged
     assert stages == sorted(stages), 'the plain one first'
     assert result.log_prior == pytest.approx(naive.log_prior(whole, result.occupied, grid.shape), abs=1e-9)
@@ -397,7 +398,7 @@ def test_with_shapes_the_objective_of_each_stage_never_falls(
 def test_with_shapes_no_shift_gains_at_the_end(seed: int) -> None:
     readings = random_readings(np.random.default_rng(seed), GRID, 100)
     search, whole = shaped(readings, GRID, ENDS, np.zeros(GRID.shape, bool))
-    result = search.run()
+    result = found_by(search)
 
     def height(occupied: np.ndarray) -> float:
         cells = occupied.reshape(GRID.shape)
@@ -415,10 +416,10 @@ def test_with_shapes_no_shift_gains_at_the_end(seed: int) -> None:
 def test_traversed_cells_stay_free() -> None:
     readings = random_readings(np.random.default_rng(3), AREA, 400, z_max=2.0)
     free = np.zeros(AREA.shape, bool)
-    before = shaped(readings, AREA, SHAPED, free)[0].run().occupied
+    before = found_by(shaped(readings, AREA, SHAPED, free)[0]).occupied
     traversed = before.reshape(AREA.shape) == 1
     search, _ = shaped(readings, AREA, SHAPED, traversed)
-    after = search.run().occupied
+    after = found_by(search).occupied
     assert before.any()
     assert not (after[traversed.ravel()]).any()
 
@@ -430,11 +431,11 @@ def test_traversed_cells_stay_free_after_any_number_of_readings() -> None:
     evidence.extend(reading, np.zeros(3_000_000, np.int64))
     traversed = np.zeros(GRID.shape, bool)
     traversed[4] = True
-    occupied = Search(evidence, SHAPED, traversed.ravel()).run().occupied.reshape(GRID.shape)
+    occupied = found_by(Search(evidence, SHAPED, traversed.ravel())).occupied.reshape(GRID.shape)
     assert not (occupied & traversed).any()
     # the same for cells of a tile around its window
     search = Search(evidence, SHAPED, window=(0, 4, 0, 12), hold=True)
-    assert not search.improve().occupied.any()
+    assert not found_by(search, 'improve').occupied.any()
 
 
 def test_search_changes_nothing_outside_its_window() -> None:
@@ -442,7 +443,7 @@ def test_search_changes_nothing_outside_its_window() -> None:
     evidence = Evidence(AREA, MODEL)
     evidence.extend(readings)
     window = (5, 20, 8, 30)
-    result = Search(evidence, SHAPED, window=window).run()
+    result = found_by(Search(evidence, SHAPED, window=window))
     occupied = result.occupied.reshape(AREA.shape)
     inside = np.zeros(AREA.shape, bool)
     inside[5:20, 8:30] = True

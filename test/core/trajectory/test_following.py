@@ -258,6 +258,20 @@ def test_calibration_corrects_odometry_without_echoes(sample: Sample, monkeypatc
     assert more == pytest.approx(1.1 * way, rel=0.03)
 
 
+def test_following_continues_after_many_turns() -> None:
+    """A turn takes a window, but little progress: there may be no place with votes among the first new windows."""
+    tour = building_tour()
+    to_and_fro = [tour[3], tour[3] + np.array([0.0, 0.5])] * 3
+    turning = drive(building_world(), np.array([*tour[:3], *to_and_fro, tour[4]]), 0.15, sonar_ring(16), NOISY, seed=3)
+    odometry = odometry_of(turning)
+    known = int(np.searchsorted(odometry.travel, 8.9))
+    begun = Odometry(odometry.stamp[: known + 1], odometry.pose[: known + 1])
+    follower = Follower(Correction(begun, begun), {}, Parameters())
+    assert follower.follow(turning.readings, odometry)
+    assert follower.windows > 2
+    assert not follower.obstacle
+
+
 def test_jump_of_odometry_ends_following(sample: Sample) -> None:
     o = sample.odometry
     pose, at = o.pose.copy(), (sample.known + len(o.stamp)) // 2

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from forward_grid_mapper.core.trajectory import heading as module
-from forward_grid_mapper.core.trajectory.heading import LEAST_GAIN, NOISES, heading
+from forward_grid_mapper.core.trajectory.heading import LEAST_GAIN, NOISES, heading, yaws_of_votes
 from forward_grid_mapper.core.trajectory.odometry_model import calibrated, motions, sensitivity, with_yaw
 from forward_grid_mapper.core.trajectory.poses import wrapped
 from forward_grid_mapper.core.trajectory.walls import (
@@ -24,6 +24,7 @@ from forward_grid_mapper.core.trajectory.walls import (
     THING,
     beside,
     count_votes,
+    votes_for,
     wall_votes,
 )
 from forward_grid_mapper.core.trajectory.windows import Odometry, Windows, corrected, cut
@@ -93,6 +94,27 @@ def echoes_along_a_way(touched) -> np.ndarray:
         sensor = round(bearing / (math.pi / 8)) * math.pi / 8
         rows.append((x, 0.0, sensor, math.pi / 16, z, 0.0, 0.0))
     return np.array(rows)
+
+
+def test_votes_between_directions_are_interpolated() -> None:
+    votes = np.random.default_rng(0).random((2, DIRECTIONS))
+    degrees = np.array([[[3.0, 3.25, 89.5]], [[-1.0, -0.5, 4 * 90.0 + 7.75]]])
+    a, b = votes
+    assert votes_for(votes, degrees) == pytest.approx(
+        np.array(
+            [
+                [[a[3], 0.75 * a[3] + 0.25 * a[4], (a[89] + a[0]) / 2]],
+                [[b[89], (b[89] + b[0]) / 2, 0.25 * b[7] + 0.75 * b[8]]],
+            ]
+        )
+    )
+    assert votes_for(votes[:0], degrees[:0]).shape == (0, 1, 3)
+
+
+def test_no_place_with_votes_measures_no_heading() -> None:
+    none = np.zeros(0)
+    correction, information = yaws_of_votes(np.zeros((0, DIRECTIONS)), none, none)
+    assert (len(correction), len(information)) == (0, 0)
 
 
 def test_wall_gets_votes_and_a_post_does_not() -> None:

@@ -14,7 +14,7 @@ from forward_grid_mapper.core.common.parameters import Parameters
 from forward_grid_mapper.core.common.readings import Readings
 from forward_grid_mapper.core.evidence.evidence import Evidence
 from forward_grid_mapper.core.mapping import Mapper
-from forward_grid_mapper.core.maps.free_ways import UNIT, add_echoes, mirror_images, not_passed
+from forward_grid_mapper.core.maps.line_of_sight import UNIT, add_echoes, mirror_images, not_passed
 from forward_grid_mapper.core.runtime import threads
 from samples import random_readings
 

@@ -13,19 +13,19 @@ from ..common.parameter_groups import SearchParameters
 from ..evidence.evidence import Evidence
 from ..search.prior import has_walls
 from .free_space import expected_passes
-from .free_ways import mirror_images, not_passed
+from .line_of_sight import mirror_images, not_passed
 from .post_processing import grown, post_process
 from .uncertainty import uncertainty_map
 
 
-class HandedOut(NamedTuple):
+class FinalMaps(NamedTuple):
     """The maximum likelihood map, int8, and the uncertainty map, float32, with values as in `MapSet`."""
 
     ml: NDArray[np.int8]
     uncertainty: NDArray[np.float32]
 
 
-def hand_out(evidence: Evidence, search: SearchParameters, traversed: NDArray[np.bool_]) -> HandedOut:
+def final_maps(evidence: Evidence, search: SearchParameters, traversed: NDArray[np.bool_]) -> FinalMaps:
     """Return the final maps from the map that the search found, shape `grid.shape`.
 
     Parameters
@@ -41,7 +41,7 @@ def hand_out(evidence: Evidence, search: SearchParameters, traversed: NDArray[np
     extension = EXTENSION if walls else 0.0
     ml = post_process(evidence, extension, search.least_passed, search.least_noticed, traversed, passes)
     if not walls:
-        return HandedOut(ml, uncertainty_map(evidence.of_occupancy(), None, ml, traversed, search))
+        return FinalMaps(ml, uncertainty_map(evidence.of_occupancy(), None, ml, traversed, search))
     images = mirror_images(evidence, ml == 1)
     if search.least_passed > 0:
         free = ml == 0
@@ -50,4 +50,4 @@ def hand_out(evidence: Evidence, search: SearchParameters, traversed: NDArray[np
     ml[images] = UNKNOWN
     uncertainty = uncertainty_map(evidence.of_occupancy(), passes, ml, traversed, search)
     uncertainty[images] = np.nan
-    return HandedOut(ml, uncertainty)
+    return FinalMaps(ml, uncertainty)
