@@ -9,9 +9,9 @@ Fractions of the readings of a sensor, given the maximum likelihood map:
     same      echoes within the most frequent 0.2 m of range, independent of the map
 
 A sensor that detects its own robot repeats one range, and the map may even explain it. So if a sensor repeats a range
-of less than half of the usual one of the others, live maps of the other sensors are used as well: an echo from where
-these are free is short, too. An echo is compared only with readings in its direction: along a corridor of smooth walls,
-the sensors at its sides hear the walls at one range all the time, while all others, at a slant, get no echo of them.
+of less than half of the usual one of the others, a live map of the others' echoes is used as well: an echo from where
+this is free is short, too. Their max-range readings do not count: in a corridor of smooth walls, sensors that look
+along it meet its walls at a slant and get no echo, while those at the sides hear them at one range all the time.
 
 Fractions are compared with those of the other sensors, since all have no echoes in a hall of smooth walls, and all have
 random ones in a crowd. A fraction is suspect if it is large *and* well above the median of the others.
@@ -28,7 +28,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..common.readings import Floats, Readings
-from ..maps.log_odds_kernel import direction_of_yaw
 from ..maps.log_odds_map import LogOddsMap
 from ..maps.map_set import MapSet
 from ..runtime.jit import kernel
@@ -58,7 +57,7 @@ BIN, BINS = 0.05, 400
 ABOVE = 0.25
 """A suspect fraction is at least this much above the median of the others."""
 FREE = 0.35
-"""Cells of the live map of the others are free below this probability."""
+"""Cells of the live map of the others' echoes are free below this probability."""
 
 
 @dataclass(frozen=True)
@@ -214,7 +213,7 @@ def health_counts(
 
 
 def health_of_counts(names: tuple[str, ...], counts: Mapping[str, NDArray[np.int64]]) -> dict[str, SensorHealth]:
-    """Return the table from sums of `health_counts`: like `sensor_health`, but without a live map of the others."""
+    """Return the table from sums of `health_counts`: like `sensor_health`, but without the echoes of the others."""
     width = round(WINDOW / BIN)
     common = []
     for row in counts['ranges']:
@@ -226,24 +225,21 @@ def health_of_counts(names: tuple[str, ...], counts: Mapping[str, NDArray[np.int
 
 
 def _from_free_space(maps: MapSet, sensor: int) -> NDArray[np.bool_]:
-    """Return which echoes of a sensor come from where the others, in that direction, have free space, shape (N,)."""
+    """Return which echoes of a sensor come from where echoes of the others show free space, shape (N,)."""
     readings = maps.readings
     mine = (readings.sensor == sensor) & readings.echo
-    count = maps.parameters.live.live_directions
-    directions = np.array([direction_of_yaw(yaw, count) for yaw in readings.yaw.tolist()])
+    live = LogOddsMap(maps.parameters)
+    live.add(readings.select((readings.sensor != sensor) & readings.echo))
+    chosen = readings.select(mine)
+    rows, columns = live.grid.cells_of(
+        chosen.x + chosen.z * np.cos(chosen.yaw), chosen.y + chosen.z * np.sin(chosen.yaw)
+    )
+    inside = (rows >= 0) & (rows < live.grid.height) & (columns >= 0) & (columns < live.grid.width)
+    probability = live.probability()
     free = np.zeros(len(readings), bool)
-    for direction in np.unique(directions[mine]):
-        alike = directions == direction
-        live = LogOddsMap(maps.parameters)
-        live.add(readings.select(alike & (readings.sensor != sensor)))
-        numbers = np.flatnonzero(alike & mine)
-        chosen = readings.select(numbers)
-        rows, columns = live.grid.cells_of(
-            chosen.x + chosen.z * np.cos(chosen.yaw), chosen.y + chosen.z * np.sin(chosen.yaw)
-        )
-        inside = (rows >= 0) & (rows < live.grid.height) & (columns >= 0) & (columns < live.grid.width)
-        # NaN, where the others have no readings, is not free
-        free[numbers[inside]] = live.probability()[rows[inside], columns[inside]] < FREE
+    there = np.flatnonzero(mine)[inside]
+    # NaN, where the others have no echoes, is not free
+    free[there] = probability[rows[inside], columns[inside]] < FREE
     return free
 
 

@@ -84,7 +84,7 @@ def test_correct_sensors_are_ok() -> None:
     assert all(row.random < 0.2 for row in table.values())
 
 
-@pytest.mark.parametrize('heading', [0.0, 0.2, 2.0])
+@pytest.mark.parametrize('heading', [0.0, 0.2, 0.4, 2.0])
 def test_sensors_beside_smooth_walls_are_not_short(heading: float) -> None:
     """They hear the walls of a corridor at one range all the time; those that look ahead never do."""
     yaw = np.radians([-90.0, -25.0, 25.0, 90.0])
