@@ -203,18 +203,21 @@ class Follower:
         """Return the tail extended by the rest of `odometry`, whose last window has just become complete."""
         new = (readings.stamp > tail.odometry.stamp[-1]) & (readings.stamp <= odometry.stamp[-1])
         windows = cut(_concatenated(tail.readings, in_canonical_order(readings.select(new))), odometry)
-        count, none = len(windows), np.zeros(len(windows), np.bool_)
+        before, count = len(tail.nodes), len(windows)
         motion = motions(calibrated(odometry, self._calibration), windows)
         nodes, places = _extrapolated(tail.nodes, motion), tail.places
-        if count >= 2 * BLOCK and count % BLOCK in (0, RECOGNISING):
-            scans = Scans(windows, self._parameters, self._stop, none)
+        # a step of sparse odometry may complete several windows
+        judged = count // BLOCK > before // BLOCK
+        recognised = (count - RECOGNISING) // BLOCK > (before - RECOGNISING) // BLOCK
+        if count >= 2 * BLOCK and (judged or recognised):
+            scans = Scans(windows, self._parameters, self._stop, np.zeros(count, np.bool_))
             block = np.arange(count - BLOCK, count)
-            if count % BLOCK:
-                places = joined(places, self._recognised(scans, nodes, block))
-            else:
+            if judged:
                 self._judge(scans, _extrapolated(tail.nodes[: block[0]], motion), block)
+            if recognised:
+                places = joined(places, self._recognised(scans, nodes, block))
         solution = solve(self._graph(windows, motion, nodes, tail._replace(places=places)), nodes, np.zeros(0))
-        self.windows += count - len(tail.nodes)
+        self.windows += count - before
         tail = Tail.of(odometry, windows.readings, solution.nodes, tail.settled, places)
         self._put_in_force(tail, windows)
         return self._shifted(tail, windows) if count >= LONGEST else tail

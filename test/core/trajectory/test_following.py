@@ -272,6 +272,34 @@ def test_following_continues_after_many_turns() -> None:
     assert not follower.obstacle
 
 
+def test_sparse_odometry_is_judged_and_recognised_as_often(sample: Sample, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A step of it completes several windows, and so may not end where a block does."""
+    metres: dict[str, list[float]] = {'_judge': [], '_recognised': []}
+
+    def noting(name: str) -> Any:
+        real = getattr(Follower, name)
+
+        def noted(self: Follower, scans: Any, nodes: Any, block: Any) -> Any:
+            metres[name].append(float(scans.windows.node_progress[block[-1]]))
+            return real(self, scans, nodes, block)
+
+        return noted
+
+    for name in metres:
+        monkeypatch.setattr(Follower, name, noting(name))
+    o, counts = sample.odometry, []
+    for thinned in (1, 100):
+        kept = np.union1d(np.arange(0, len(o.stamp), thinned), len(o.stamp) - 1)
+        begun = kept[kept <= sample.known]
+        known = Correction(*(Odometry(o.stamp[begun], path.pose[begun]) for path in (o, sample.true)))
+        Follower(known, {}, Parameters()).follow(sample.readings, Odometry(o.stamp[kept], o.pose[kept]))
+        counts.append([len(found) for found in metres.values()])
+        for found in metres.values():
+            found.clear()
+    assert min(counts[0]) > 3
+    assert np.abs(np.subtract(*counts)).max() <= 1
+
+
 def test_jump_of_odometry_ends_following(sample: Sample) -> None:
     o = sample.odometry
     pose, at = o.pose.copy(), (sample.known + len(o.stamp)) // 2
