@@ -286,9 +286,8 @@ def chosen_parameters(options: argparse.Namespace) -> Chosen:
     settings = dict(parse_setting(text) for text in options.set)
     for name in settings:
         if name not in DEPRECATED and find(name).group == 'node':
-            raise ParameterError(
-                f'--set {name}: this parameter is only for the node; use the options of this command for topics'
-            )
+            instead = f'; {INSTEAD[name]}' if name in INSTEAD else ''
+            raise ParameterError(f'--set {name}: this parameter is only for the node{instead}')
     warnings = [text] if (text := _ignored(values, options.params)) else []
     parameters = Parameters.from_flat({**values, **settings})
     if options.dump_config:
