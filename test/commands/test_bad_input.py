@@ -477,6 +477,7 @@ def test_impossible_option_is_rejected_with_reason(
     [
         (['--learn', 'much'], '--learn'),
         (['--sett', 'p_hit=0.5', '--unknown'], 'unrecognized arguments'),
+        (['--refine_poses'], 'unrecognized arguments: --refine_poses; did you mean --refine-poses?'),
         (['--params'], '--params'),
         (['--range-topics', ''], 'argument --range-topics: the name of a topic is expected'),
         (['--range-topics', ','], 'argument --range-topics: the name of a topic is expected'),
