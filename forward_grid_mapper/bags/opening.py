@@ -104,6 +104,8 @@ def _open_folder(folder: Path) -> tuple[list[Source], str | None]:
             return [_open_file(present[0])], None
         if present:
             raise BagError(_of_several(folder, present))
+        if (folder / 'maps.npz').exists():
+            raise BagError(f'{folder} is not a bag: it contains maps of process_bag or save_maps.')
         inside = sorted(path.parent for path in folder.glob('*/metadata.yaml'))
         hint = f' There is one in it: {inside[0]}' if inside else ''
         if not inside and (deeper := sorted(path.parent.parent for path in folder.glob('*/*/metadata.yaml'))):

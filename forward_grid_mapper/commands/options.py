@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import argparse
 import codecs
+import difflib
 import math
 import os
 import sys
 from collections.abc import Mapping, Sequence
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, NoReturn
 
 from ..core.common.errors import OutputError, ParameterError
 from ..core.common.former_parameters import DEPRECATED
@@ -105,6 +106,14 @@ class BagParser(argparse.ArgumentParser):
             if not options.range_topics:
                 self.error('argument --range-topics: the name of a topic is expected, not an empty one')
         return options
+
+    def error(self, message: str) -> NoReturn:
+        """Exit with a usage message; it names the option that an unknown one is like, such as --refine_poses."""
+        unknown = next((word for word in message.split() if word.startswith('--')), '').partition('=')[0]
+        if message.startswith('unrecognized arguments') and unknown:
+            near = difflib.get_close_matches(unknown, self._option_string_actions, n=1)
+            message += f'; did you mean {near[0]}?' if near else ''
+        super().error(message)
 
     def _bags_in_options(self, options: argparse.Namespace) -> list[str]:
         """Return the last words of an option with several words that can only be bags; one if only one is allowed."""
@@ -286,9 +295,8 @@ def chosen_parameters(options: argparse.Namespace) -> Chosen:
     settings = dict(parse_setting(text) for text in options.set)
     for name in settings:
         if name not in DEPRECATED and find(name).group == 'node':
-            raise ParameterError(
-                f'--set {name}: this parameter is only for the node; use the options of this command for topics'
-            )
+            instead = f'; {INSTEAD[name]}' if name in INSTEAD else ''
+            raise ParameterError(f'--set {name}: this parameter is only for the node{instead}')
     warnings = [text] if (text := _ignored(values, options.params)) else []
     parameters = Parameters.from_flat({**values, **settings})
     if options.dump_config:

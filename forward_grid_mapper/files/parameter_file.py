@@ -96,6 +96,9 @@ def parse_setting(text: str) -> tuple[str, Any]:
         raise ParameterError(f'{text!r} is not of the form name=value, such as p_hit=0.6')
     if name in DEPRECATED:
         return name, value
+    if name.startswith('sensors.'):
+        frame = name.removeprefix('sensors.').removesuffix('.pose')
+        raise ParameterError(f'{text!r} is a pose of a sensor: give --sensor {frame}=x,y,yaw')
     row = find(name)
     return name, row.check(_typed(row, value))
 

@@ -42,7 +42,7 @@ NO_STATIC = (
 NAMED = 3
 """Most frames that are named as examples."""
 
-MOST_OPTIONS = 24
+MOST_OPTIONS = 8
 """Most sensors for which a message contains options to copy."""
 
 

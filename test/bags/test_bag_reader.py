@@ -181,12 +181,15 @@ def test_path_without_a_bag_is_rejected_with_reason(tmp_path: Path) -> None:
     (tmp_path / 'text.mcap').write_text('not a bag\n')
     (tmp_path / 'empty.db3').touch()
     (tmp_path / 'folder').mkdir()
+    (tmp_path / 'maps').mkdir()
+    (tmp_path / 'maps' / 'maps.npz').touch()
     os.mkfifo(tmp_path / 'pipe')
     for name, words in {
         'absent': 'does not exist',
         'text.mcap': 'is not a bag',
         'empty.db3': 'is empty',
         'folder': 'neither metadata.yaml nor',
+        'maps': 'contains maps of process_bag',
         'pipe': 'neither a file nor a folder',
     }.items():
         with pytest.raises(BagError, match=words), Bag(tmp_path / name):

@@ -470,6 +470,7 @@ def test_pose_at_ten_million_metres_is_rejected(tmp_path: Path) -> None:
         (['--set', 'online=maybe'], ['online', 'true or false']),
         (['--set', 'over_range=ignore'], ['over_range', 'no_echo, discard']),
         (['--set', 'p_hit'], ["'p_hit'", 'name=value']),
+        (['--set', 'sensors.sonar_00.pose=[0.1, 0.0, 0.0]'], ['pose of a sensor', '--sensor sonar_00=x,y,yaw']),
         (['--sensor', 'sonar_00=1,2'], ["'sonar_00=1,2'", 'frame=x,y,yaw']),
         (['--sensor', 'sonar_00=1,2,nan'], ['sonar_00=1,2,nan', 'frame=x,y,yaw']),
         (['--learn', '-1'], ['--learn', 'negative']),
@@ -488,6 +489,7 @@ def test_impossible_option_is_rejected_with_reason(
     [
         (['--learn', 'much'], '--learn'),
         (['--sett', 'p_hit=0.5', '--unknown'], 'unrecognized arguments'),
+        (['--refine_poses'], 'unrecognized arguments: --refine_poses; did you mean --refine-poses?'),
         (['--params'], '--params'),
         (['--range-topics', ''], 'argument --range-topics: the name of a topic is expected'),
         (['--range-topics', ','], 'argument --range-topics: the name of a topic is expected'),

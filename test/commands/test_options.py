@@ -169,7 +169,9 @@ def test_parameter_of_the_node_is_rejected_on_the_command_line(
     with pytest.raises(ParameterError, match=f'--set {name}: this parameter is only for the node'):
         chosen_parameters(options)
     assert code_of(process_bag.main, tmp_path / 'absent', '--set', f'{name}={value}', '-o', tmp_path / 'maps') == 1
-    assert f'--set {name}: this parameter is only for the node' in capsys.readouterr().err
+    error = capsys.readouterr().err
+    assert f'--set {name}: this parameter is only for the node' in error
+    assert ('give --refine-poses' in error) == (name == 'refine_poses')
 
 
 def test_changed_node_parameters_in_a_file_give_a_warning(

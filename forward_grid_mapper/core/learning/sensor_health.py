@@ -91,7 +91,7 @@ class SensorHealth:
         if not self.readings:
             return f'no readings: {self.verdict}'
         return (
-            f'{self.readings} readings, {self.random:.0%} random, {self.no_echo:.0%} no echo, '
+            f'{self.readings} readings, {self.random:.0%} random, {self.no_echo:.0%} max range, '
             f'{self.missed:.0%} missed, {self.short:.0%} short: {self.verdict}'
         )
 

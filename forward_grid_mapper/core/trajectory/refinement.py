@@ -380,7 +380,11 @@ def _heading_lost(drive: _Drive, certainty: float) -> _Attempt:
 def _gain_words(better: Gain) -> str:
     if not np.isfinite(better.error):
         return 'too few readings overlap with maps of other readings to compare the prediction with that of odometry'
-    return f'readings are predicted {better.mean:+.3f} ± {better.error:.3f} nats a reading better than with odometry'
+    better_or_worse = 'better' if better.mean >= 0 else 'worse'
+    return (
+        f'readings are predicted {better_or_worse} than with odometry, by {abs(better.mean):.3f} ± {better.error:.3f} '
+        f'nats a reading'
+    )
 
 
 def _recognition_words(part: float) -> str:

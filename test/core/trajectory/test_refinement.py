@@ -114,7 +114,7 @@ def test_recognised_places_prove_what_nearby_readings_do_not(tour, bent, monkeyp
     monkeypatch.setattr(refinement, 'gain_over_drive', lambda *rest: Gain(-0.05, 0.01))
     found, true = Refiner(Parameters()).run(*bent), odometry_of(tour).pose
     assert found.accepted
-    assert found.reason.startswith('with recognised places, readings are predicted +')
+    assert found.reason.startswith('with recognised places, readings are predicted better than')
     assert rms_after_alignment(found.trajectory.pose, true) < 0.2
     # the same without such places, and without walls that contradict the yaw
     monkeypatch.setattr(refinement, 'gain_at_revisits', lambda *rest: Gain(0.0, 0.01))
@@ -132,7 +132,7 @@ def test_walls_are_no_proof_if_recognised_places_do_not_confirm(bent, monkeypatc
     monkeypatch.setattr(refinement, 'gain_at_revisits', lambda *rest: Gain(0.001, 0.01))
     left = Refiner(Parameters()).run(*bent)
     assert not left.accepted
-    assert left.reason.startswith('with recognised places, readings are predicted +')
+    assert left.reason.startswith('with recognised places, readings are predicted better than')
     assert 'does not show that odometry is wrong' in left.reason
     # if the robot visited no place twice, walls are proof, unless readings are predicted worse
     monkeypatch.setattr(refinement, 'has_revisits', lambda *rest: False)
@@ -142,7 +142,7 @@ def test_walls_are_no_proof_if_recognised_places_do_not_confirm(bent, monkeypatc
     monkeypatch.setattr(refinement, 'gain_at_revisits', lambda *rest: Gain(-0.02, 0.01))
     worse = Refiner(Parameters()).run(*bent)
     assert not worse.accepted
-    assert worse.reason.startswith('readings are predicted -')
+    assert worse.reason.startswith('readings are predicted worse than')
 
 
 @pytest.mark.parametrize(
