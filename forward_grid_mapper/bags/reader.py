@@ -145,7 +145,7 @@ class Bag:
         topics : Topics
             From `choose_topics`.
         progress : callable, optional
-            Called with (done, total) messages repeatedly, and at the end.
+            Called with (done, total) messages as they are read.
 
         Raises
         ------
@@ -161,7 +161,7 @@ class Bag:
         def tell(more: int) -> None:
             nonlocal done
             done += more
-            if progress and more and not done % _PROGRESS_STEP:
+            if progress and more:
                 progress(done, max(done, total))
 
         for channels, columns, raw in self._raw(wanted, chain, tell):
@@ -186,8 +186,6 @@ class Bag:
                 f'{self.path} is damaged or cut off ({self._reasons()}) and no message of the chosen topics can be '
                 f'read; {repair_hint(self.path)}.'
             )
-        if progress:
-            progress(done, max(done, total))
 
     def _raw(
         self, wanted: Collection[tuple[str, str]], chain: TransformChain | None, tell: Callable[[int], None]
