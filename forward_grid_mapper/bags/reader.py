@@ -242,15 +242,16 @@ class Bag:
                 parents[str(item.child_frame_id).lstrip('/')] = str(item.header.frame_id).lstrip('/')
         return parents
 
-    def constant_transforms_on_tf(self) -> StaticTransforms:
-        """Return the constant transforms on `/tf`, and those on `/tf_static`, which take precedence.
+    def constant_transforms_on_tf(self, topics: Topics) -> StaticTransforms:
+        """Return the constant transforms on `/tf`, and the result of `static_transforms`, which takes precedence.
 
-        Simulators, and the static_transform_publisher of ROS 1's tf, repeat fixed transforms there.
+        Simulators, and the static_transform_publisher of ROS 1's tf, repeat fixed transforms there. `topics` are those
+        to map from.
         """
         transforms = StaticTransforms('/tf')
         for parent, child, numbers in constant_transforms(self._searched(self.moving_topics())):
             _add(transforms, parent, child, numbers[:3], numbers[3:])
-        transforms.take(self.static_transforms())
+        transforms.take(self.static_transforms(topics))
         return transforms
 
     def moving_topics(self) -> set[str]:
