@@ -250,7 +250,7 @@ def read_drive(
         if not associator.received and spans.left_out:
             first, last = spans.left_out
             raise InputError(
-                f'{path} has no reading in the part {part}; its messages span {(last - first) / 1e9:.1f} s'
+                f'{path} has no reading in the part {part}; its messages span {(last - first) / NANOSECONDS:.1f} s'
             )
         raise _nothing_associated(associator, lookup, spans, undecodable, poses)
     first, last = associator.buffer.stamps
