@@ -87,7 +87,10 @@ def paths_of(xy: NDArray[np.float64]) -> list[NDArray[np.float64]]:
 
 
 def joined_paths(paths: Sequence[NDArray[np.float64]]) -> NDArray[np.float64]:
-    """Return paths of shape (P, 2) as one that is separated by rows of NaN, from which `paths_of` returns them."""
+    """Return paths of shape (P, 2) as one, separated by rows of NaN.
+
+    `paths_of` is the inverse, except that it returns an empty path for none.
+    """
     gap = np.full((1, 2), np.nan)
     parts = [part for path in paths for part in (gap, path)]
     return np.concatenate(parts[1:]) if parts else np.zeros((0, 2))
