@@ -147,10 +147,10 @@ class EmWorker:
         if outcome.maps is not None:
             run.found(outcome.maps)
             run.stage, run.progress = 'judging sensors', None
-            self._judge(run, outcome, outcome.maps)
+            self._judge(outcome, outcome.maps)
         self._end(run, outcome)
 
-    def _judge(self, run: Run, outcome: Outcome, maps: MapSet) -> None:
+    def _judge(self, outcome: Outcome, maps: MapSet) -> None:
         """Add the health of sensors and warnings; the maps are valid without them."""
         try:
             outcome.health = sensor_health(maps)
