@@ -139,7 +139,7 @@ def _packed_or_not(file: Path) -> Path:
 
 def storage_files(folder: Path) -> list[Path]:
     """Return the storage files in a folder by name; without compressed ones whose decompressed file is there."""
-    files = sorted(filter(is_storage_file, folder.iterdir()), key=_natural_order)
+    files = sorted(filter(is_storage_file, folder.iterdir()), key=lambda file: natural_order(file.name))
     names = {file.name for file in files}
     return [file for file in files if file.name == plain_name(file) or plain_name(file) not in names]
 
@@ -348,6 +348,6 @@ def _magic(file: Path) -> bytes:
         return stream.read(16)
 
 
-def _natural_order(file: Path) -> list[tuple[int, str]]:
+def natural_order(name: str) -> list[tuple[int, str]]:
     """Return a sorting key that puts bag_10 after bag_9."""
-    return [(int(part), '') if part.isdecimal() else (-1, part) for part in re.split(r'(\d+)', file.name)]
+    return [(int(part), '') if part.isdecimal() else (-1, part) for part in re.split(r'(\d+)', name)]

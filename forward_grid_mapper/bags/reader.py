@@ -145,7 +145,7 @@ class Bag:
         topics : Topics
             From `choose_topics`.
         progress : callable, optional
-            Called with (done, total) messages repeatedly, and at the end.
+            Called with (done, total) messages as they are read.
 
         Raises
         ------
@@ -161,7 +161,7 @@ class Bag:
         def tell(more: int) -> None:
             nonlocal done
             done += more
-            if progress and more and not done % _PROGRESS_STEP:
+            if progress and more:
                 progress(done, max(done, total))
 
         for channels, columns, raw in self._raw(wanted, chain, tell):
@@ -186,8 +186,6 @@ class Bag:
                 f'{self.path} is damaged or cut off ({self._reasons()}) and no message of the chosen topics can be '
                 f'read; {repair_hint(self.path)}.'
             )
-        if progress:
-            progress(done, max(done, total))
 
     def _raw(
         self, wanted: Collection[tuple[str, str]], chain: TransformChain | None, tell: Callable[[int], None]
@@ -244,15 +242,16 @@ class Bag:
                 parents[str(item.child_frame_id).lstrip('/')] = str(item.header.frame_id).lstrip('/')
         return parents
 
-    def constant_transforms_on_tf(self) -> StaticTransforms:
-        """Return the constant transforms on `/tf`, and those on `/tf_static`, which take precedence.
+    def constant_transforms_on_tf(self, topics: Topics) -> StaticTransforms:
+        """Return the constant transforms on `/tf`, and the result of `static_transforms`, which takes precedence.
 
-        Simulators, and the static_transform_publisher of ROS 1's tf, repeat fixed transforms there.
+        Simulators, and the static_transform_publisher of ROS 1's tf, repeat fixed transforms there. `topics` are those
+        to map from.
         """
         transforms = StaticTransforms('/tf')
         for parent, child, numbers in constant_transforms(self._searched(self.moving_topics())):
             _add(transforms, parent, child, numbers[:3], numbers[3:])
-        transforms.take(self.static_transforms())
+        transforms.take(self.static_transforms(topics))
         return transforms
 
     def moving_topics(self) -> set[str]:

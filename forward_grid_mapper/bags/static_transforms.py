@@ -76,16 +76,17 @@ class StaticTransforms:
         self.rejected.pop(child, None)
 
     def take(self, other: StaticTransforms) -> None:
-        """Add the transforms of another topic, which take precedence."""
+        """Add the transforms of other topics, which take precedence."""
+        self.contradicted |= other.contradicted
         for child, (parent, transform) in other._parents.items():
-            known = self._parents.get(child)
+            known, topic = self._parents.get(child), other._topics.get(child, other._topic)
             if known is not None and not (known[0] == parent and np.allclose(known[1], transform, atol=SAME)):
                 self.contradicted[child] = (
-                    f'{self._topics.get(child, self._topic)} and {other._topic} contain different poses of {child!r}; '
-                    f'that of {other._topic} is used. If it belongs to another robot, set --sensor'
+                    f'{self._topics.get(child, self._topic)} and {topic} contain different poses of {child!r}; that of '
+                    f'{topic} is used. If it belongs to another robot, set --sensor'
                 )
             self._parents[child] = parent, transform
-            self._topics[child] = other._topic
+            self._topics[child] = topic
         self.rejected |= {child: why for child, why in other.rejected.items() if child not in self._parents}
         self.rejected = {child: why for child, why in self.rejected.items() if child not in self._parents}
 

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from ..core.common.errors import InputError
 from ..core.common.readings import Readings
+from ..core.common.words import counted
 from ..core.maps.cell_evidence import CellEvidence, cell_evidence
 from ..core.messages.message_types import NANOSECONDS
 from ..files.map_archive import MapArchive, read_npz
@@ -130,8 +131,7 @@ def explanation(maps: MapArchive, readings: Readings, found: CellEvidence, shown
     uncertainty, standard = _percent(maps.uncertainty[cell]), _percent(maps.live[cell])
     yield f'  obstacle: {uncertainty} (uncertainty map), {standard} (standard map)'
     count = len(found.readings)
-    from_readings = f'{count} reading' if count == 1 else f'{count} readings'
-    yield f'  {_nats(found.data)} nats from {from_readings}, {_nats(found.prior)} from the prior of walls'
+    yield f'  {_nats(found.data)} nats from {counted(count, "reading")}, {_nats(found.prior)} from the prior of walls'
     groups = (
         (('end here', 'ends here'), found.ends_here),
         (
@@ -221,8 +221,7 @@ def _decisive_evidence(maps: MapArchive, found: CellEvidence, state: int) -> str
     if typical >= LEAST_TYPICAL:
         more = math.ceil(abs(total) / typical)
         kind = f'the one with the most evidence for {other}'
-        readings = 'reading' if more == 1 else 'readings'
-        return f'to be {other} it takes {abs(total):.1f} nats more: {more} more {readings} like {kind}'
+        return f'to be {other} it takes {abs(total):.1f} nats more: {counted(more, "more reading")} like {kind}'
     none = f'so far no single reading gives {LEAST_TYPICAL:g} nats or more for that'
     return f'to be {other} it takes {abs(total):.1f} nats more; {none}'
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import os
 import subprocess
 import sys
@@ -156,7 +155,7 @@ class LiveNode:
     def _check(self, end: float) -> None:
         if self._process is None or self._process.poll() is not None:
             raise MapperError(f'the node ended; {self._last_words()}')
-        if not time.monotonic() < end < math.inf:
+        if time.monotonic() >= end:
             raise MapperError(f'the node does not answer; {self._last_words()}')
 
     def _last_words(self) -> str:

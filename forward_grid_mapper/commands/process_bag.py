@@ -173,23 +173,13 @@ def process(options: argparse.Namespace) -> int:
             source['warnings'].append(_learned(maps))
         if not maps.statistics['converged']:
             source['warnings'].append(NOT_CONVERGED)
-        path, before = along.path_xy, NOWHERE
-        more: dict[str, Any] = {}
-        if refined is not None:
-            before = NOWHERE if refined.odometry_xy is None else refined.odometry_xy
-            more = {'extras': refined.texts, 'odometry_xy': before}
-        report = write_results(folder, maps, source, path, _title(drives), **more)
+        path, title = along.path_xy, _title(drives)
+        odometry_xy, texts = (NOWHERE, {}) if refined is None else (refined.odometry_xy, refined.texts)
+        report = write_results(folder, maps, source, path, title, extras=texts, odometry_xy=odometry_xy)
         if options.write_bag:
             _write_bag(folder / 'maps.mcap_bag', maps, drives)
         if options.rerun:
-            write_rerun(
-                folder / RECORDING,
-                maps,
-                report_text(report),
-                _title(drives),
-                path,
-                NOWHERE if before is None else before,
-            )
+            write_rerun(folder / RECORDING, maps, report_text(report), title, path, odometry_xy)
     tell(options, report, output)
     if options.show:
         show(output / 'report.html')

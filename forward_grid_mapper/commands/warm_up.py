@@ -6,6 +6,7 @@ import argparse
 import time
 from collections.abc import Sequence
 
+from ..core.common.words import counted
 from ..core.runtime import compiling
 from ..core.runtime.jit import CACHE
 from ..core.warm_up import STEPS
@@ -28,7 +29,7 @@ def compile_kernels(options: argparse.Namespace) -> int:
     for name, compile_all in STEPS.items():
         print(f'{name} kernels …', flush=True)
         compile_all()
-    made = f'{compiling.count()} compilations' if compiling.count() else 'nothing to compile'
+    made = counted(compiling.count(), 'compilation') if compiling.count() else 'nothing to compile'
     print(f'all kernels are in {CACHE} after {time.monotonic() - begin:.1f} s, {made}')
     return 0
 

@@ -23,6 +23,7 @@ from matplotlib.ticker import MaxNLocator
 from matplotlib.transforms import Affine2D
 from numpy.typing import NDArray
 
+from ..core.common.words import counted
 from .output_folder import distinguished
 from .panels import DRIVES, PATH, UNKNOWN_COLOUR, Box, Picture, coarse, paths_of
 
@@ -242,7 +243,7 @@ def _named(picture: Picture) -> list[Line2D]:
     names = [name if len(name) <= _NAME else f'…{name[1 - _NAME :]}' for name in names]
     handles = [Line2D([], [], color=DRIVES[k], linewidth=1.6, label=f'{k + 1}: {name}') for k, name in enumerate(names)]
     if count > len(names):
-        more = f'and {count - len(names)} more drives' if names else f'paths of {count} drives'
+        more = f'and {counted(count - len(names), "more drive")}' if names else f'paths of {count} drives'
         handles.append(Line2D([], [], linestyle='none', label=more))
     return handles
 

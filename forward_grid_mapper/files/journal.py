@@ -158,6 +158,9 @@ class Journal:
             self._next, self._next_points = contents.next, contents.next_points
             self._work_in_background()
             return
+        if self._closing:
+            # a file that was closed meanwhile seems to be damaged
+            return
         if source is not None:
             self._drive = Drive(following(source))
         self._work_in_background()
@@ -277,7 +280,7 @@ class Journal:
 
     def _let_go(self) -> None:
         """Unlock the folder."""
-        self._writer.close()
+        self._writer.end()
         self._lock.release()
 
     def _work(self, syncer: Syncer) -> None:

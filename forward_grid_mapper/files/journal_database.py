@@ -12,6 +12,7 @@ import fcntl
 import os
 import re
 import sqlite3
+import threading
 from collections.abc import Iterable, Iterator
 from contextlib import closing, suppress
 from dataclasses import dataclass
@@ -133,7 +134,9 @@ class FolderLock:
 
 
 class DriveWriter:
-    """Writes rows into the file of a drive, and checks that the file is unchanged by others. For one thread at a time.
+    """Writes rows into the file of a drive, and checks that the file is unchanged by others.
+
+    For one thread at a time, except that any thread may call `end`.
 
     Attributes
     ----------
@@ -148,6 +151,9 @@ class DriveWriter:
         self._size = 0
         self._files: dict[Path, os.stat_result] = {}
         self._forsaken: list[sqlite3.Connection] = []
+        # held while the file is opened or closed, so that it cannot be opened after `end`
+        self._opening = threading.Lock()
+        self._ended = False
 
     def resume(self, drive: Drive) -> bool:
         """Open a file of an earlier run to continue it; return whether all of it is valid.
@@ -166,7 +172,7 @@ class DriveWriter:
             for _ in self.readings(contents):
                 pass
             drive.next = contents.next
-            if not contents.harm:
+            if not contents.harm and self._database is not None:
                 return True
         except sqlite3.OperationalError as error:
             if 'locked' in str(error):
@@ -179,9 +185,10 @@ class DriveWriter:
         return False
 
     def readings(self, contents: Contents) -> Iterator[Readings]:
-        """Yield the readings of the open file, and fill `contents`."""
-        assert self._database is not None and self.drive is not None
-        yield from readings(self._database, self._size, contents)
+        """Yield the readings of the open file, and fill `contents`; none after `end`."""
+        database = self._database
+        if database is not None:
+            yield from readings(database, self._size, contents)
 
     def write(self, drive: Drive, rows: Iterable[Insert], following: int) -> Path:
         """Commit rows to the file of a drive, which is created if needed; return SQLite's log, which contains them.
@@ -238,8 +245,18 @@ class DriveWriter:
             self.close()
             raise
 
+    def end(self) -> None:
+        """Close the file for ever, also if another thread opens or reads it."""
+        with self._opening:
+            self._ended = True
+            self._close()
+
     def close(self) -> None:
         """Close the file; SQLite then moves its log into it."""
+        with self._opening:
+            self._close()
+
+    def _close(self) -> None:
         database, files = self._database, self._files
         self.drive, self._database, self._files = None, None, {}
         if database is None:
@@ -270,16 +287,19 @@ class DriveWriter:
         unbounded(self._database)
 
     def _connect(self, drive: Drive) -> None:
-        self._size = extent(drive.path)
-        database = connect(drive.path, 'mode=rw', self._size)
-        try:
-            database.execute('PRAGMA synchronous=NORMAL')
-            check(database, drive.path)
-        except BaseException:
-            database.close()
-            raise
-        self._database, self.drive = database, drive
-        self._remember()
+        with self._opening:
+            if self._ended:
+                raise GoneError(drive, 'the journal was closed')
+            self._size = extent(drive.path)
+            database = connect(drive.path, 'mode=rw', self._size)
+            try:
+                database.execute('PRAGMA synchronous=NORMAL')
+                check(database, drive.path)
+            except BaseException:
+                database.close()
+                raise
+            self._database, self.drive = database, drive
+            self._remember()
 
     def _next(self) -> int:
         """Return the number of the first reading after those in the file."""

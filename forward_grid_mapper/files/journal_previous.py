@@ -34,7 +34,7 @@ NOTE = 'it has the format of the previous version, which the next version will n
 
 
 def read(path: Path, contents: Contents) -> Iterator[Readings]:
-    """Yield the readings of a journal file of the previous format, about ten thousand at a time; fills `contents`.
+    """Yield the readings of a journal file of the previous format, as `journal_reader.read` does, and fill `contents`.
 
     Raises
     ------

@@ -93,7 +93,7 @@ def log_of(path: Path) -> Path:
 
 
 def read(path: Path, contents: Contents) -> Iterator[Readings]:
-    """Yield the readings of a journal file, about ten thousand at a time, and fill `contents`.
+    """Yield the readings of a journal file, about `journal_format.CHUNK` at a time, and fill `contents`.
 
     Raises
     ------

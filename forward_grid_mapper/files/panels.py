@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -83,3 +84,13 @@ def paths_of(xy: NDArray[np.float64]) -> list[NDArray[np.float64]]:
     """Return the paths that are separated by rows of NaN, one for each drive; paths may be empty."""
     parts = np.split(xy, np.flatnonzero(~np.isfinite(xy).all(axis=1)))
     return [part[np.isfinite(part).all(axis=1)] for part in parts]
+
+
+def joined_paths(paths: Sequence[NDArray[np.float64]]) -> NDArray[np.float64]:
+    """Return paths of shape (P, 2) as one, separated by rows of NaN.
+
+    `paths_of` is the inverse, except that it returns an empty path for none.
+    """
+    gap = np.full((1, 2), np.nan)
+    parts = [part for path in paths for part in (gap, path)]
+    return np.concatenate(parts[1:]) if parts else np.zeros((0, 2))

@@ -65,7 +65,7 @@ def of_ros_arguments(text: str) -> str:
 def of_domain(environment: Mapping[str, str]) -> str:
     """Return what is wrong with ROS_DOMAIN_ID, or ''."""
     text = environment.get('ROS_DOMAIN_ID', '').strip()
-    if re.fullmatch(r'[+-]?\d+', text or '0') and int(text or '0') <= HIGHEST_DOMAIN:
+    if re.fullmatch(r'\+?[0-9]+', text or '0') and int(text or '0') <= HIGHEST_DOMAIN:
         return ''
     return f'ROS_DOMAIN_ID is {text}, not a whole number from 0 to {HIGHEST_DOMAIN}'
 

@@ -14,6 +14,7 @@ from ..core.common.errors import Cancelled, InputError, MapperError
 from ..core.common.grid import Grid
 from ..core.common.parameters import Parameters
 from ..core.common.readings import Readings
+from ..core.common.words import counted
 from ..core.learning.input_warnings import input_warnings
 from ..core.learning.sensor_health import SensorHealth, sensor_health
 from ..core.mapping import Mapper
@@ -77,7 +78,7 @@ class Run:
 
     def __str__(self) -> str:
         # their number is known once the run has begun
-        of = f' of {self.count} readings' if self.count else ''
+        of = f' of {counted(self.count, "reading")}' if self.count else ''
         text = f'{self.stage}{of}, {self.seconds:.1f} s'
         if self.progress:
             p = self.progress
@@ -146,10 +147,10 @@ class EmWorker:
         if outcome.maps is not None:
             run.found(outcome.maps)
             run.stage, run.progress = 'judging sensors', None
-            self._judge(run, outcome, outcome.maps)
+            self._judge(outcome, outcome.maps)
         self._end(run, outcome)
 
-    def _judge(self, run: Run, outcome: Outcome, maps: MapSet) -> None:
+    def _judge(self, outcome: Outcome, maps: MapSet) -> None:
         """Add the health of sensors and warnings; the maps are valid without them."""
         try:
             outcome.health = sensor_health(maps)
@@ -202,7 +203,7 @@ def summary(maps: MapSet, seconds: float) -> str:
     """Return the result of a run in one line."""
     s = maps.statistics
     return (
-        f'{len(maps.readings)} readings, {s["occupied"]} occupied cells, {seconds:.2f} seconds '
+        f'{counted(len(maps.readings), "reading")}, {s["occupied"]} occupied cells, {seconds:.2f} seconds '
         f'({s["iterations"]} iterations, {s["flips"]} flips, {s["shifts"]} shifts, '
         f'log-likelihood {maps.log_likelihood:.1f}, objective {maps.objective:.1f})'
         + ('' if s['converged'] else '; NOT converged: raise max_iterations')

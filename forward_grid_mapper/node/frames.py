@@ -168,7 +168,7 @@ class MapFrame:
     timeout : float
         Longest wait, seconds by stamps; may be changed.
     dropped : int
-        Messages for which TF had no transform in time.
+        Messages for which TF had no transform in time, since the begin or the last `forget`.
     """
 
     def __init__(self, map_frame: str, transforms: Transforms, timeout: float) -> None:
@@ -244,6 +244,11 @@ class MapFrame:
                 self.dropped += 1
             self._held.popleft()
         return ready
+
+    def forget(self) -> None:
+        """Forget the messages that wait, and the number of those dropped."""
+        self._held.clear()
+        self.dropped = 0
 
     def _note(self, transform: Any | Later, planar: bool) -> None:
         """Note whether there is a planar transform, and since when there is none."""

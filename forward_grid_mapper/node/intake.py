@@ -269,6 +269,7 @@ class Intake:
         """Forget the messages held back, and all counts."""
         self._held.clear()
         self._ranges_held = 0
+        self._map_frame.forget()
         for losses in (*self.range_losses, self._odometry_losses):
             losses.clear()
         self._losses_logged = 0

@@ -60,12 +60,12 @@ def _spin(executor: Any, node: Any) -> None:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the node until it is stopped; return the exit code."""
-    if '--version' in (sys.argv[1:] if arguments is None else arguments):
+    arguments = sys.argv[1:] if arguments is None else list(arguments)
+    if '--version' in arguments:
         print(f'mapper of forward_grid_mapper {__version__}')
         return 0
     if threading.current_thread() is threading.main_thread():
         signal.signal(signal.SIGINT, signal.SIG_DFL)
-    arguments = sys.argv[1:] if arguments is None else list(arguments)
     if '-h' in arguments or '--help' in arguments:
         print(USAGE)
         return 0

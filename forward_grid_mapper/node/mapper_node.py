@@ -273,11 +273,14 @@ class MapperNode(ManagedNode):
             self._when_ready.append(lambda: answered(handler, reply, self.get_logger().error))
 
     def _thin_in_background(self, thin: Callable[[], Any], done: Callable[[Any], None]) -> None:
+        # that of this configuration, which may have ended when the work is done
+        inbox = self.inbox
+
         def work() -> None:
             thinned = thin()
-            self.inbox.put(lambda: done(thinned))
+            inbox.put(lambda: done(thinned))
 
-        self._readings_worker.put(work, lambda why: self.inbox.put(lambda: done(None)))
+        self._readings_worker.put(work, lambda why: inbox.put(lambda: done(None)))
 
     # parameters
 

@@ -22,15 +22,14 @@ from .background import Worker
 class OnlineSnapshot(NamedTuple):
     """The online map at a moment.
 
-    `epoch` is that of the worker when it was made; `ml` and `uncertainty` are as in `MapSet`, `searched` is a map
-    from which EM may start. All have shape `grid.shape`, and nothing changes them.
+    `epoch` is that of the worker when it was made; `ml` and `uncertainty` are as in `MapSet`, have shape `grid.shape`,
+    and nothing changes them.
     """
 
     epoch: int
     grid: Grid
     ml: NDArray[np.int8]
     uncertainty: NDArray[np.float32]
-    searched: NDArray[np.int8]
 
 
 class OnlineWorker:
@@ -177,4 +176,4 @@ class OnlineWorker:
             if not grid.size or epoch != self.epoch:
                 return
             self._start = grid, searched
-        self._publish_snapshot(OnlineSnapshot(epoch, grid, ml, uncertainty, searched))
+        self._publish_snapshot(OnlineSnapshot(epoch, grid, ml, uncertainty))

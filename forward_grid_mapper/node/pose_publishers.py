@@ -79,15 +79,13 @@ class PosePublishers:
         """Whether the transform goes to TF."""
         return self._send is not None
 
-    def send(
-        self, frames: tuple[str, str, str], correction: Floats, newest: tuple[int, Pose2], repeat: bool = True
-    ) -> None:
+    def send(self, frames: tuple[str, str], correction: Floats, newest: tuple[int, Pose2], repeat: bool = True) -> None:
         """Send the transform, or the pose, if odometry or the correction is new, or to repeat it.
 
         Parameters
         ----------
-        frames : (str, str, str)
-            Names of the map frame, the odometry frame and the base frame.
+        frames : (str, str)
+            Names of the map frame and the odometry frame.
         correction : float64, shape (3,)
             The pose of the odometry frame in the map frame.
         newest : (int, Pose2)
@@ -106,7 +104,7 @@ class PosePublishers:
             # TF warns of a second transform with the same stamp, and odometry may have ended
             stamp = sent_stamp + 1
         self._sent, self._due = (stamp, (x, y, yaw)), now + REPEAT
-        map_frame, odom_frame, _ = (frame.lstrip('/') for frame in frames)
+        map_frame, odom_frame = (frame.lstrip('/') for frame in frames)
         if self._send is not None:
             transform = TransformStamped(child_frame_id=odom_frame)
             transform.header.frame_id = map_frame

@@ -6,6 +6,7 @@ from collections.abc import Mapping
 
 from diagnostic_msgs.msg import DiagnosticStatus
 
+from ..core.common.words import counted
 from ..core.learning.sensor_health import SensorHealth, health_warning
 from .diagnostics import listed, status
 
@@ -41,7 +42,7 @@ class SensorWatch:
         quiet = quiet or {}
         table = self._table
         values = {
-            sensor: f'{count} readings, {silent / max(count, 1):.0%} max range'
+            sensor: f'{counted(count, "reading")}, {silent / max(count, 1):.0%} max range'
             for sensor, (count, silent) in counts.items()
         }
         values |= {sensor: str(row) for sensor, row in table.items()}

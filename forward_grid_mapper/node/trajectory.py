@@ -288,7 +288,7 @@ class Trajectory:
                 self.following.end(JUMPED_BACK)
         if associator.odometry_ahead and not self._lasts(newest[0]):
             return
-        frames = self.frame, associator.map_frame, associator.base_frame
+        frames = self.frame, associator.map_frame
         self._out.send(frames, self._correction_at(newest[0]), newest, self.listening())
         self._advance(*newest)
 
@@ -308,7 +308,7 @@ class Trajectory:
     def _advance(self, stamp: int, pose: Pose2) -> None:
         """Update the distance driven, and do the work that is due."""
         before, self._at = self._at or (stamp, pose), (stamp, pose)
-        self._add_distance(before, stamp, pose)
+        self._add_distance(before, pose)
         if self.following is not None and self._parameters.node.refine_poses:
             self.following.offer(pose, lambda: (self._associator.buffer.snapshot(), self._associator.record.snapshot()))
         if self.driven - self._shown_at >= PATH_EVERY and not self._showing:
@@ -322,7 +322,7 @@ class Trajectory:
         if due and self.refine():
             self._refined_at = self.driven
 
-    def _add_distance(self, before: tuple[int, Pose2], stamp: int, pose: Pose2) -> None:
+    def _add_distance(self, before: tuple[int, Pose2], pose: Pose2) -> None:
         """Add the distance driven since the last check, without jumps; many messages may have arrived since."""
         if may_jump(Odometry(*self._associator.record.since(before[0]))) and self._add_jump(before[0]):
             self._counted = pose

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from ..core.common.errors import InputError
 from ..core.common.readings import Readings
+from ..core.common.words import counted
 from ..core.messages.message_types import Pose2
 from ..core.messages.thinning import mixed, name_hashes
 
@@ -213,7 +214,7 @@ def _is_where(frame: str, pose: Pose2) -> str:
 
 
 def _and_more(frames: Sequence[str]) -> str:
-    return f' (and so on for {len(frames) - 1} more sensors)' if len(frames) > 1 else ''
+    return f' (and so on for {counted(len(frames) - 1, "more sensor")})' if len(frames) > 1 else ''
 
 
 def listed(names: Sequence[str]) -> str:

@@ -20,6 +20,7 @@ from ..core.maps.map_set import MapSet
 from ..core.messages.message_types import Pose2
 from ..core.messages.reading_buffer import bounded
 from ..files.output_folder import readable
+from ..files.panels import joined_paths
 from ..files.quality_warning import thinned
 from .contradictions import Described, check_frames, contradictions, limits_of, listed, shared_echoes
 from .drive import WHOLE, Drive, Part, thinning_note
@@ -64,10 +65,7 @@ class Drives:
     @property
     def path_xy(self) -> NDArray[np.float64]:
         """Paths of the robots, shape (P, 2), metres; separated by rows of NaN."""
-        parts = [self.drives[0].path_xy]
-        for drive in self.drives[1:]:
-            parts += [np.full((1, 2), np.nan), drive.path_xy]
-        return np.concatenate(parts)
+        return joined_paths([drive.path_xy for drive in self.drives])
 
     @property
     def map_frame(self) -> str:

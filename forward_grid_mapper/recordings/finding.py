@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
 
-from ..bags.opening import plain_name, storage_files
+from ..bags.opening import natural_order, plain_name, storage_files
 from ..core.common.errors import BagError
 from ..files.journal import drive_file
 from ..files.output_folder import readable
@@ -45,7 +45,7 @@ def find_recordings(words: Sequence[Path | str]) -> Recordings:
         path = Path(word)
         matches = [path]
         if not path.exists() and glob.has_magic(str(word)):
-            matches = [Path(name) for name in sorted(glob.glob(str(word)), key=_natural)]  # noqa: PTH207 (absolute too)
+            matches = [Path(name) for name in sorted(glob.glob(str(word)), key=natural_order)]  # noqa: PTH207 (absolute too)
             if not matches:
                 raise BagError(f'no file or folder matches {word}')
         for match in matches:
@@ -63,7 +63,7 @@ def _bags_of(path: Path) -> Recordings:
     try:
         if drive_file(path) is not None:
             return nothing
-        inside = sorted(path.iterdir(), key=lambda entry: _natural(entry.name))
+        inside = sorted(path.iterdir(), key=lambda entry: natural_order(entry.name))
         files = _files_in(path)
         below = [entry for entry in inside if entry.is_dir() and not entry.name.startswith('.')]
         folders = [entry for entry in below if _is_bag(entry)]
@@ -104,8 +104,3 @@ def _holds_recordings(folder: Path) -> bool:
 def _left_out(path: Path, skipped: Sequence[Path]) -> str:
     names = ', '.join(entry.name for entry in skipped)
     return f'in {readable(path)} these are left out: {names}; if they are recordings, add them to the command line'
-
-
-def _natural(name: str) -> list[tuple[int, str]]:
-    """Return a sorting key that puts day_10 after day_9."""
-    return [(int(part), '') if part.isdecimal() else (-1, part) for part in re.split(r'(\d+)', name)]

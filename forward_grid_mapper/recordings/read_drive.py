@@ -6,6 +6,7 @@ from collections.abc import Callable, Mapping, Sequence
 from functools import cache, partial
 from pathlib import Path
 
+from ..bags.choice import Topics
 from ..bags.decoder import TF_MESSAGE
 from ..bags.poses import BASE_FRAMES
 from ..bags.reader import Bag, skipped
@@ -225,7 +226,7 @@ def read_drive(
             topics = bag.choose_topics(range_topics, odom_topic, any_poses=True)
         else:
             topics = bag.choose_range_topics(range_topics)
-        constant = partial(_constant_transforms, path)
+        constant = partial(_constant_transforms, path, topics)
         lookup = Extrinsics(extrinsics, bag.static_transforms(topics), constant, OtherBags(others, topics))
         associator = BatchAssociator(lookup, parameters)
         live = FullLiveMap(associator, parameters)
@@ -250,7 +251,7 @@ def read_drive(
         if not associator.received and spans.left_out:
             first, last = spans.left_out
             raise InputError(
-                f'{path} has no reading in the part {part}; its messages span {(last - first) / 1e9:.1f} s'
+                f'{path} has no reading in the part {part}; its messages span {(last - first) / NANOSECONDS:.1f} s'
             )
         error = _nothing_associated(associator, lookup, spans, undecodable, poses)
         # the rest of the messages may be in the part that cannot be read
@@ -282,10 +283,10 @@ def read_drive(
     return Drive(associator, source, live)
 
 
-def _constant_transforms(path: Path | str) -> StaticTransforms:
+def _constant_transforms(path: Path | str, topics: Topics) -> StaticTransforms:
     """Return the constant transforms of a bag, which may be open elsewhere."""
     with Bag(path) as bag:
-        return bag.constant_transforms_on_tf()
+        return bag.constant_transforms_on_tf(topics)
 
 
 def _choosing(topics: Sequence[str]) -> str:

@@ -24,6 +24,7 @@ from ..core.trajectory.registration import moved_to, readings_moved, register
 from ..core.trajectory.windows import Odometry
 from ..files.calibration_file import calibration_text
 from ..files.output_folder import readable
+from ..files.panels import joined_paths
 from ..files.trajectory_text import trajectory_data, trajectory_files
 from .drive import Drive
 from .drives import Drives
@@ -85,13 +86,12 @@ class RefinedDrives:
             outcome.trajectory.pose[:, :2] if _moved(odometry, outcome) else drive.path_xy
             for drive, odometry, outcome in self._each
         ]
-        return _parted(paths)
+        return joined_paths(paths)
 
     @property
-    def odometry_xy(self) -> NDArray[np.float64] | None:
-        """The paths of odometry of the drives that moved; None if none did."""
-        paths = [drive.path_xy for drive, odometry, outcome in self._each if _moved(odometry, outcome)]
-        return _parted(paths) if paths else None
+    def odometry_xy(self) -> NDArray[np.float64]:
+        """The paths of odometry of the drives that moved, as `path_xy`; empty if none did."""
+        return joined_paths([drive.path_xy for drive, odometry, outcome in self._each if _moved(odometry, outcome)])
 
     def with_live(self, maps: MapSet) -> MapSet:
         """Return the maps with the live map of all readings, if no drive moved and `max_readings` restricts EM."""
@@ -266,10 +266,3 @@ def _moved(odometry: Odometry, outcome: Refinement) -> bool:
 
 def _named(watch: Watch, name: str, stage: str, part: float) -> None:
     watch(name + stage, part)
-
-
-def _parted(paths: list[NDArray[np.float64]]) -> NDArray[np.float64]:
-    parts = [paths[0]]
-    for path in paths[1:]:
-        parts += [np.full((1, 2), np.nan), path]
-    return np.concatenate(parts)

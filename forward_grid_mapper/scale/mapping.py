@@ -29,6 +29,7 @@ from ..core.messages.message_types import Pose2
 from ..core.sensor.cone_table import check_size
 from ..core.tiles.schedule import Schedule
 from ..core.tiles.tiling import Tiling
+from ..files.panels import joined_paths
 from ..files.quality_warning import NOT_CONVERGED
 from ..recordings.contradictions import Described, check_frames, contradictions
 from ..recordings.drives import same_drive, source_of_all, unreadable
@@ -201,8 +202,7 @@ class ScaledMapper:
         write_json(self._job.folder.plan, plan)
         tiling = plan_of(self._job.folder, self._job.size).tiling
         paths = [np.array(result[k]['path'], np.float64).reshape(-1, 2) for k in kept]
-        parted = [part for path in paths for part in (path, np.full((1, 2), np.nan))][:-1]
-        return Found(tiling, source, tuple(names), np.concatenate(parted))
+        return Found(tiling, source, tuple(names), joined_paths(paths))
 
     def _search(self, tiling: Tiling, boxes: dict[int, Grid]) -> dict[str, Any]:
         """Search until no tile changes; return counts. `boxes` has the tiles in the order of the first searches."""

@@ -177,6 +177,24 @@ def test_progress_is_reported(tmp_path: Path) -> None:
     assert calls == [(1000, 2200), (2000, 2200), (2200, 2200)]
 
 
+def test_progress_continues_in_all_files_of_a_split_bag(tmp_path: Path) -> None:
+    whole = tmp_path / 'whole'
+    whole.mkdir()
+    names = []
+    for number in range(2):
+        with BagWriter(tmp_path / f'part_{number}') as writer:
+            for message in sample_messages(1100):
+                if isinstance(message, RangeMessage):
+                    writer.write_range('/sonar', message._replace(stamp=message.stamp + number * 1000 * SECOND))
+        names.append(Path(shutil.copy(storage_file(tmp_path / f'part_{number}'), whole)).name)
+    listed = ''.join(f'    - {name}\n' for name in names)
+    (whole / 'metadata.yaml').write_text(f'rosbag2_bagfile_information:\n  relative_file_paths:\n{listed}')
+    calls = []
+    with Bag(whole) as bag:
+        list(bag.messages(Topics(('/sonar',), ''), lambda *call: calls.append(call)))
+    assert calls == [(1000, 2200), (1100, 2200), (2100, 2200), (2200, 2200)]
+
+
 def test_path_without_a_bag_is_rejected_with_reason(tmp_path: Path) -> None:
     (tmp_path / 'text.mcap').write_text('not a bag\n')
     (tmp_path / 'empty.db3').touch()

@@ -12,6 +12,7 @@ from bag_samples import START
 from forward_grid_mapper.bags.choice import Topics
 from forward_grid_mapper.bags.namespaces import Assigned, by_precedence, ranges_of
 from forward_grid_mapper.bags.reader import Bag
+from forward_grid_mapper.bags.static_transforms import StaticTransforms
 from forward_grid_mapper.bags.writer import BagWriter
 from forward_grid_mapper.core.common.errors import BagError
 from forward_grid_mapper.core.common.parameters import Parameters
@@ -24,15 +25,15 @@ MOUNTS = {'/r1': Pose2(0.1, 0.0, 0.0), '/r2': Pose2(0.3, 0.2, math.pi / 2)}
 class RobotWriter(BagWriter):
     """Writes the messages of a robot in a namespace."""
 
-    def write_mount(self, topic: str, mount: Pose2) -> None:
-        """Write the pose of its sonar."""
+    def write_mount(self, topic: str, mount: Pose2, parent: str = 'base_link', child: str = 'sonar') -> None:
+        """Write the pose of its sonar, or of another frame."""
         posed = self._pose(mount)
         offset = self._make('geometry_msgs/msg/Vector3', x=mount.x, y=mount.y, z=0.0)
         transform = self._make('geometry_msgs/msg/Transform', translation=offset, rotation=posed.orientation)
         stamped: Any = self._make(
             'geometry_msgs/msg/TransformStamped',
-            header=self._header(topic, START, 'base_link'),
-            child_frame_id='sonar',
+            header=self._header(topic, START, parent),
+            child_frame_id=child,
             transform=transform,
         )
         content = self._make('tf2_msgs/msg/TFMessage', transforms=[stamped])
@@ -89,6 +90,35 @@ def test_equal_static_transforms_give_no_warning(tmp_path: Path) -> None:
     with Bag(two_robots(tmp_path / 'bag', {'/r1': MOUNTS['/r1'], '': MOUNTS['/r1']})) as bag:
         transforms = bag.static_transforms(Topics(('/r1/sonar',), '/r1/odometry/filtered'))
     assert transforms.doubts('base_link', 'sonar') == []
+
+
+@pytest.mark.parametrize('robot', ['/r1', '/r2'])
+def test_constant_transforms_continue_the_static_ones_of_the_robot(tmp_path: Path, robot: str) -> None:
+    with RobotWriter(tmp_path / 'bag') as writer:
+        for namespace, mount in MOUNTS.items():
+            writer.write_mount(f'{namespace}/tf_static', mount, child='mast')
+            writer.write_mount(f'{namespace}/tf', Pose2(0.0, 0.0, 0.0), parent='mast')
+    with Bag(tmp_path / 'bag') as bag:
+        transforms = bag.constant_transforms_on_tf(Topics((f'{robot}/sonar',), f'{robot}/odom'))
+    assert transforms.lookup('base_link', 'sonar') == pytest.approx(MOUNTS[robot])
+    assert transforms.doubts('base_link', 'sonar') == []
+
+
+def test_topics_of_different_poses_are_named_after_all_were_joined() -> None:
+    parts = []
+    for k, topic in enumerate(('/tf_static', '/r1/tf_static', '/tf')):
+        parts.append(StaticTransforms(topic))
+        parts[k].add('base_link', 'sonar', (0.1 * k, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0))
+    static, constant = StaticTransforms(), parts[2]
+    static.take(parts[0])
+    static.take(parts[1])
+    everything = StaticTransforms()
+    everything.take(static)
+    (doubt,) = everything.doubts('base_link', 'sonar')
+    assert doubt.startswith('/tf_static and /r1/tf_static contain different poses')
+    constant.take(static)
+    (doubt,) = constant.doubts('base_link', 'sonar')
+    assert doubt.startswith('/tf and /r1/tf_static contain different poses')
 
 
 def test_range_topics_of_a_robot_are_chosen_by_namespace() -> None:

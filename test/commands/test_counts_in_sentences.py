@@ -11,8 +11,10 @@ from forward_grid_mapper.commands import experiment_maps
 from forward_grid_mapper.commands.console import Ticker
 from forward_grid_mapper.core.common.parameters import Parameters
 from forward_grid_mapper.core.common.words import counted
+from forward_grid_mapper.core.messages.message_types import Pose2
 from forward_grid_mapper.files.picture import figures_text
 from forward_grid_mapper.files.report_text import report_text
+from forward_grid_mapper.recordings.contradictions import Described, contradictions
 
 
 def test_count_with_singular_or_plural() -> None:
@@ -32,6 +34,17 @@ def test_counts_in_report_and_picture() -> None:
     several = report_text({'result': {'readings': 40, 'unexplained': 2}})
     assert '2 readings (5.0 %) are most likely random measurements\n' in several
     assert figures_text(1, 0.1, -2.0).startswith('1 reading   ·')
+
+
+@pytest.mark.parametrize(('sensors', 'words'), [(2, '1 more sensor)'), (3, '2 more sensors)')])
+def test_number_of_sensors_that_were_moved_between_drives(sensors: int, words: str) -> None:
+    frames = [f'sonar_{k}' for k in range(sensors)]
+    drives = [
+        Described(name, 'map', 'base_link', dict.fromkeys(frames, Pose2(x, 0.0, 0.0)), {})
+        for name, x in (('monday', 0.0), ('tuesday', 1.0))
+    ]
+    (warning,) = contradictions(drives)
+    assert f'(and so on for {words}' in warning
 
 
 @pytest.mark.parametrize('seeds', [1, 2])

@@ -49,6 +49,8 @@ def test_unknown_values_are_left_out_with_a_comment() -> None:
         ('travel_factor: fast', "'fast', not a finite number"),
         ('travel_factor: true', 'not a finite number'),
         ('travel_factor: .nan', 'not a finite number'),
+        ('travel_factor: -.inf', 'not a finite number'),
+        (f'travel_factor: 1{400 * "0"}', 'not a finite number'),
         ('travel_factor: 0.3', 'which is not possible for a calibration of wheels'),
         ('turn_per_metre_deg: 90', 'which is not possible for a calibration of wheels'),
     ],

@@ -419,6 +419,35 @@ def test_journal_closed_while_it_is_restored_writes_nothing(tmp_path: Path) -> N
     assert numbers(journal.path)[0] == list(range(10))
 
 
+@pytest.mark.parametrize('step', ['_connect', 'readings'])
+def test_journal_closed_while_its_file_is_opened_releases_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, step: str
+) -> None:
+    journal, _ = opened(tmp_path)
+    written(journal, made(0, 10))
+    journal.close()
+    warnings: list[str] = []
+    journal = Journal(tmp_path, warnings.append)
+    begin, begun, go_on = getattr(DriveWriter, step), threading.Event(), threading.Event()
+
+    def slow(*arguments: object) -> object:
+        begun.set()
+        assert go_on.wait(20.0)
+        return begin(*arguments)
+
+    with ThreadPoolExecutor() as pool, monkeypatch.context() as patched:
+        patched.setattr(DriveWriter, step, slow)
+        found = pool.submit(lambda: list(journal.restore()))
+        assert begun.wait(20.0)
+        journal.close()
+        go_on.set()
+        assert found.result(20.0) == []
+    assert warnings == []
+    another, chunks = opened(tmp_path)
+    assert [len(chunk) for chunk in chunks] == [10]
+    another.close()
+
+
 def test_file_size_limit_is_handled_as_a_full_disk(tmp_path: Path) -> None:
     program = (
         'import resource, signal, sys, time; sys.path.insert(0, sys.argv[2])\n'

@@ -14,7 +14,7 @@ from made_maps import made_maps
 from forward_grid_mapper import files
 from forward_grid_mapper.core.common.errors import OutputError
 from forward_grid_mapper.core.common.grid import Grid
-from forward_grid_mapper.files.panels import DRIVES, coarse
+from forward_grid_mapper.files.panels import DRIVES, coarse, joined_paths, paths_of
 from forward_grid_mapper.files.picture import compose, write_picture
 
 PATH = np.stack([np.linspace(-1, 1, 50), np.zeros(50)], axis=1)
@@ -61,6 +61,13 @@ def test_each_drive_has_its_own_colour(tmp_path: Path, count: int) -> None:
         seen = {colour for _, colour in drawn.convert('RGB').getcolors(1_000_000)}
     for k, colour in enumerate(DRIVES):
         assert (tuple(bytes.fromhex(colour[1:])) in seen) == (k < count), colour
+
+
+@pytest.mark.parametrize('lengths', [[], [2], [3, 0, 1]])
+def test_joined_paths_are_parted_again(lengths: list[int]) -> None:
+    paths = [np.full((length, 2), float(k)) for k, length in enumerate(lengths)]
+    found = paths_of(joined_paths(paths))
+    assert [path.tolist() for path in found] == [path.tolist() for path in paths or [np.zeros((0, 2))]]
 
 
 def test_pyplot_is_not_imported(tmp_path: Path) -> None:

@@ -47,7 +47,7 @@ def test_bad_arguments_are_rejected_with_reason(domain: int, arguments: list[str
     assert found == code
 
 
-@pytest.mark.parametrize('number', ['5000', 'home', '1.5'])
+@pytest.mark.parametrize('number', ['5000', '-5', 'home', '1.5'])
 def test_invalid_domain_is_rejected(domain: int, number: str) -> None:
     assert rejected(domain, ROS_DOMAIN_ID=number) == (
         1,

@@ -309,6 +309,24 @@ def test_odometry_that_waited_for_the_map_frame_is_no_jump() -> None:
     assert robot.associator.readings.x.min() > 5.0
 
 
+def test_odometry_that_waits_for_the_map_frame_is_forgotten_at_a_reset() -> None:
+    tf = Localiser()
+    frame = MapFrame('map', Transforms(tf, ExtrapolationException), 2.0)
+    robot = Taking(map_frame=frame)
+    robot.intake.begin()
+    for k in range(30):
+        robot.odometry(100.0 + 0.1 * k)
+    assert frame.dropped == 9
+    robot.intake.forget()
+    assert frame.dropped == 0 and frame.newest_stamp is None
+    # the localiser begins, and also has the transforms of the time before the reset
+    tf.publish(round(100e9))
+    tf.publish(round(110e9))
+    robot.odometry(103.0)
+    robot.node.turn()
+    assert robot.associator.odometry_received == 1
+
+
 def test_failed_subscription_removes_all_subscriptions(monkeypatch: pytest.MonkeyPatch) -> None:
     """Otherwise the readings of the others would come twice after a retry."""
     robot = Taking()

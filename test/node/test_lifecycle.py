@@ -39,6 +39,7 @@ from test_mapper_node import RELIABLE
 
 from forward_grid_mapper.core.common.errors import MapperError
 from forward_grid_mapper.core.common.parameters import find
+from forward_grid_mapper.core.messages import reading_buffer
 from forward_grid_mapper.node import managed, mapper_node
 from forward_grid_mapper.node.intake import Intake
 from forward_grid_mapper.node.kernels import Kernels
@@ -258,6 +259,25 @@ def test_clean_up_leaves_no_readings_or_threads(inside: Callable[..., Inside]) -
         gc.collect()
         assert [part() for part in parts] == [None] * len(parts)
         robot.until(lambda: {*threading.enumerate()} <= others)
+
+
+def test_clean_up_during_thinning_is_no_failure(inside: Callable[..., Inside], monkeypatch: pytest.MonkeyPatch) -> None:
+    robot = inside(max_readings=80).start()
+    readings, begun, go = robot.node._readings_worker, threading.Event(), threading.Event()
+    original = reading_buffer.kept
+
+    def slow(*arguments: Any) -> Any:
+        begun.set()
+        assert go.wait(60.0)
+        return original(*arguments)
+
+    monkeypatch.setattr(reading_buffer, 'kept', slow)
+    robot.drive(0, 91)
+    robot.until(begun.is_set)
+    assert robot.node.trigger_deactivate() == robot.node.trigger_cleanup() == TransitionCallbackReturn.SUCCESS
+    go.set()
+    readings.close(60.0)
+    assert readings.trouble == ''
 
 
 @pytest.fixture

@@ -265,7 +265,7 @@ def test_latest_possible_stamp_is_published(inside: Callable[..., Inside], tf2_r
     publishers = pose_publishers.PosePublishers(inside().node)
     latest = (2**31 - 1) * NANOSECONDS + NANOSECONDS - 1
     for _ in range(2):
-        publishers.send(('map', 'odom', 'base_link'), np.array([0.1, 0.0, 0.0]), (latest, Pose2(1.0, 0.0, 0.0)))
+        publishers.send(('map', 'odom'), np.array([0.1, 0.0, 0.0]), (latest, Pose2(1.0, 0.0, 0.0)))
         publishers._due = 0.0
     stamps = [transform.header.stamp for transform in tf2_ros.sent]
     assert [(stamp.sec, stamp.nanosec) for stamp in stamps] == [divmod(latest, NANOSECONDS)] * 2

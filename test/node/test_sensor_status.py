@@ -33,6 +33,7 @@ def test_dead_sensor_is_named_after_em() -> None:
     assert before.name == 'mapper: sensors' and before.level == DiagnosticStatus.OK
     assert values(before)['sonar_04'].endswith('readings, 100% max range')
     assert len(before.values) == 24
+    assert values(watch.status('mapper', {'sonar': (1, 1)})) == {'sonar': '1 reading, 100% max range'}
 
     maps = Mapper(Parameters()).run(readings)
     watch.take(sensor_health(maps))
