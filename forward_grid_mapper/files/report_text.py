@@ -214,7 +214,7 @@ def _result(data: dict[str, Any]) -> Iterator[str]:
         are = 'is most likely a random measurement' if unexplained == 1 else 'are most likely random measurements'
         sought = any(source.get('trajectory') for source in (data.get('input') or {}, *(data.get('drives') or [])))
         many = unexplained > _MANY * (readings or math.inf) and not sought
-        hint = ': many, as with odometry that drifts (refine_poses)' if many else ''
+        hint = ': many, as with odometry that drifts (refine_poses), or wrong poses of sensors' if many else ''
         yield from _line('Random', f'{counted(unexplained, "reading", ",")} ({share}) {are}{hint}')
     work = [f'{statistics[key]:,} {key}' for key in ('pairs', 'iterations', 'flips', 'shifts') if statistics.get(key)]
     if (converged := statistics.get('converged')) is not None:

@@ -108,7 +108,7 @@ def test_broken_sensor_is_in_the_warnings_and_the_table() -> None:
 
 def test_many_random_readings_give_a_hint_to_refine_poses() -> None:
     maps = made_maps(readings=200)
-    hint = 'many, as with odometry that drifts (refine_poses)'
+    hint = 'many, as with odometry that drifts (refine_poses), or wrong poses of sensors'
     for part, source, expected in ((50, {}, True), (20, {}, False), (50, {'trajectory': {'refined': False}}, False)):
         some = dataclasses.replace(maps, unexplained=np.arange(200) < part)
         assert (hint in ' '.join(report_text(report_data(some, source)).split())) == expected
