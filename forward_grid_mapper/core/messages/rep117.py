@@ -241,7 +241,7 @@ def _instead_of_no_echo(
             for frame, numbers in accepted.items()
         ]
         most = sum(share >= INSTEAD for share in shares) > len(shares) / 2
-        if most and INSTEAD * received <= count <= MANY * received and reason not in known:
+        if most and max(INSTEAD * received, ENOUGH) <= count <= MANY * received and reason not in known:
             warnings.append(
                 f'{count} of {received} readings were rejected as {reason}, and no other reading is without an echo: '
                 f'does the driver send this if there is no echo? {_SILENT_DRIVER[0].upper()}{_SILENT_DRIVER[1:]}'

@@ -72,6 +72,8 @@ def test_warning_of_no_echo_that_is_rejected() -> None:
     assert sensor_rejections(by_frame, accepted, known={'nan_range'}) == []
     assert sensor_rejections({frame: {'nan_range': 40} for frame in accepted}, accepted) == []
     assert sensor_rejections({'sonar_0': {'too_near': 30}, 'sonar_1': {'too_near': 30}}, accepted) == []
+    # an object may be too near to a robot that begins to drive
+    assert sensor_rejections({frame: {'too_near': 7} for frame in accepted}, accepted) == []
     # the pose is missing, or the user does not want these readings
     assert sensor_rejections({frame: {'pose_gap': 10} for frame in accepted}, accepted) == []
 
