@@ -215,7 +215,7 @@ def _result(data: dict[str, Any]) -> Iterator[str]:
         sought = any(source.get('trajectory') for source in (data.get('input') or {}, *(data.get('drives') or [])))
         many = unexplained > _MANY * (readings or math.inf) and not sought
         option = '--refine-poses' if (data.get('input') or {}).get('bag') else 'refine_poses'
-        hint = f': many, as with odometry that drifts ({option})' if many else ''
+        hint = f': many, as with odometry that drifts ({option}), or wrong poses of sensors' if many else ''
         yield from _line('Random', f'{counted(unexplained, "reading", ",")} ({share}) {are}{hint}')
     work = [f'{statistics[key]:,} {key}' for key in ('pairs', 'iterations', 'flips', 'shifts') if statistics.get(key)]
     if (converged := statistics.get('converged')) is not None:

@@ -82,7 +82,7 @@ def estimate_words(estimates: Mapping[str, Estimate]) -> str:
         said = calibration_words({name: value}) if abs(value) > sigma else ''
         if not said:
             said = f'{_EXACT[name]} within the accuracy'
-        error = math.degrees(sigma) if name in ('bias', 'heading') else 100 * sigma
+        error = math.degrees(sigma) if name in ('bias', 'heading') else 100 * sigma / (1 + value) ** 2
         words.append(f'{said} (± {error:.1f}{"°" if name in ("bias", "heading") else " %"})')
     if unknown := [_ASKED[name] for name in CALIBRATION if name not in estimates]:
         words.append(f'the drive does not show {" or ".join(unknown)}')
@@ -106,8 +106,8 @@ _ASKED = {
 def calibration_words(calibration: Mapping[str, float]) -> str:
     """Return the errors of odometry in words for the robot's owner; '' if they are too small."""
     words = []
-    # the calibration corrects the measurement, so the measurement has the opposite error
-    scale, turn_scale = -calibration.get('scale', 0.0), -calibration.get('turn_scale', 0.0)
+    # the calibration corrects the measurement, so the measurement has the inverse factor, or the opposite error
+    scale, turn_scale = (1 / (1 + calibration.get(name, 0.0)) - 1 for name in ('scale', 'turn_scale'))
     bias, heading = -calibration.get('bias', 0.0), calibration.get('heading', 0.0)
     if abs(scale) >= LEAST_SCALE:
         words.append(f'distances are measured {abs(scale):.1%} too {"long" if scale > 0 else "short"}')

@@ -14,7 +14,7 @@ from forward_grid_mapper.core.trajectory.outcome import Refinement
 from forward_grid_mapper.core.trajectory.windows import Odometry
 from forward_grid_mapper.files.pose_files import poses_from_tum
 from forward_grid_mapper.files.report_text import report_text
-from forward_grid_mapper.files.trajectory_text import calibration_words, trajectory_data, tum_text
+from forward_grid_mapper.files.trajectory_text import calibration_words, estimate_words, trajectory_data, tum_text
 
 
 def test_tum_lines_hold_stamp_position_and_quaternion() -> None:
@@ -40,6 +40,11 @@ def test_calibration_in_words() -> None:
         'turns are measured 2.0 % too large'
     )
     assert calibration_words({'scale': 0.001}) == ''
+    # turns that are measured twice as large as they are have the factor 0.5
+    assert calibration_words({'turn_scale': -0.5}) == 'turns are measured 100.0 % too large'
+    assert estimate_words({'scale': Estimate(0.25, 0.025)}).startswith(
+        'distances are measured 20.0 % too short (± 1.6 %)'
+    )
     assert '1.0° to the right of' in calibration_words({'heading': -math.radians(1.0)})
 
 

@@ -7,6 +7,7 @@ Fractions of the readings of a sensor, given the maximum likelihood map:
     missed    no echo, though the map has an obstacle within 3/4 of max range in the cone
     short     a random echo, nearer than half the way to the first obstacle of the cone, or to max range if none
     same      echoes within the most frequent 0.2 m of range, independent of the map
+    alike     of the short readings, those within their most frequent 0.2 m of range
 
 A sensor that detects its own robot repeats one range, and the map may even explain it. So if a sensor repeats a range
 of less than half of the usual one of the others, a live map of the others' echoes is used as well: an echo from where
@@ -49,7 +50,8 @@ PHANTOMS = 0.5
 SHORT = 0.5
 RANDOM = 0.5
 SAME, WINDOW = 0.8, 0.2
-"""A sensor that repeats one range has at least this fraction of its readings within so many metres."""
+"""A sensor that repeats one range has at least this fraction of its readings, or of its short readings, within so many
+metres: it may hear its robot only now and then."""
 CLOSE = 0.7
 """If at least this fraction of the random readings is short, but not at one range, a person moves near the sensor."""
 BIN, BINS = 0.05, 400
@@ -64,8 +66,9 @@ FREE = 0.35
 class SensorHealth:
     """One row of the table; fractions lie in [0, 1] and are NaN without readings.
 
-    `common` is the mean (the middle, from counts) of the most frequent 0.2 m of range, metres. `verdict` is 'ok', 'few
-    readings', 'something moves near it', 'never hears anything', 'always short' or 'mostly random'.
+    `common` is the mean (the middle, from counts) of the most frequent 0.2 m of range, metres; that of the short
+    readings, if these are alike. `verdict` is 'ok', 'few readings', 'something moves near it', 'never hears anything',
+    'always short' or 'mostly random'.
     """
 
     readings: int
@@ -74,6 +77,7 @@ class SensorHealth:
     missed: float
     short: float
     same: float
+    alike: float
     common: float
     verdict: str
 
@@ -157,7 +161,8 @@ def sensor_health(maps: MapSet) -> dict[str, SensorHealth]:
         if held >= max(SAME * numbers[k], 1) and middle < NEAR * _median(np.delete(usual_range, k)):
             marks['short'] |= _from_free_space(maps, k)
     counts = {kind: np.bincount(readings.sensor, weights=mark, minlength=count)[:count] for kind, mark in marks.items()}
-    return _table(readings.sensor_names, numbers, counts, common)
+    near = [commonest_range(readings.z[marks['short'] & (readings.sensor == k)]) for k in range(count)]
+    return _table(readings.sensor_names, numbers, counts, common, near)
 
 
 def _marks(readings: Readings, obstacle: Floats, unexplained: NDArray[np.bool_]) -> dict[str, NDArray[np.bool_]]:
@@ -176,18 +181,21 @@ def _table(
     numbers: NDArray[np.int64],
     counts: Mapping[str, NDArray[Any]],
     common: Sequence[tuple[int, float]],
+    near: Sequence[tuple[int, float]],
 ) -> dict[str, SensorHealth]:
-    """Return the table from counts by sensor, shape (S,), and the `commonest_range` of each."""
+    """Return the table from counts by sensor, shape (S,), and `commonest_range` of each and of its short readings."""
     with np.errstate(invalid='ignore'):
         shares: dict[str, Floats] = {kind: column / numbers for kind, column in counts.items()}
         shares['same'] = np.array([held for held, _ in common], np.float64) / numbers
+        shares['alike'] = np.array([held for held, _ in near], np.float64) / counts['short']
     made = {}
     for k, name in enumerate(names):
         mine = {kind: float(share[k]) for kind, share in shares.items()}
         others = {kind: _median(np.delete(share, k)) for kind, share in shares.items()}
         usual = _median(np.delete(numbers, k).astype(np.float64))
         verdict = _verdict(int(numbers[k]), usual, mine, others)
-        made[name] = SensorHealth(int(numbers[k]), **mine, common=common[k][1], verdict=verdict)
+        middle = near[k][1] if mine['alike'] >= SAME else common[k][1]
+        made[name] = SensorHealth(int(numbers[k]), **mine, common=middle, verdict=verdict)
     return made
 
 
@@ -199,29 +207,37 @@ def health_counts(
 ) -> dict[str, NDArray[np.int64]]:
     """Return counts by sensor of a portion of the readings, int64, shape (S,), for `health_of_counts`.
 
-    `ranges`, shape (S, B), is a histogram of the ranges of echoes with bins of `BIN` metres; the last bin has all
-    longer ones.
+    `ranges` and `short_ranges`, shape (S, B), are histograms of the ranges of echoes, and of short ones, with bins of
+    `BIN` metres; the last bin has all longer ones.
     """
     size = len(readings.sensor_names)
     marks = _marks(readings, first_obstacles(forward, ml), unexplained)
     counts = {kind: np.bincount(readings.sensor[mark], minlength=size) for kind, mark in marks.items()}
     counts['readings'] = np.bincount(readings.sensor, minlength=size)
-    ranges = np.zeros((size, BINS), np.int64)
-    echo = readings.echo
-    np.add.at(ranges, (readings.sensor[echo], np.minimum(readings.z[echo] / BIN, BINS - 1).astype(np.int64)), 1)
-    return {**counts, 'ranges': ranges}
+    for kind, chosen in (('ranges', readings.echo), ('short_ranges', marks['short'])):
+        counts[kind] = np.zeros((size, BINS), np.int64)
+        bins = np.minimum(readings.z[chosen] / BIN, BINS - 1).astype(np.int64)
+        np.add.at(counts[kind], (readings.sensor[chosen], bins), 1)
+    return counts
 
 
 def health_of_counts(names: tuple[str, ...], counts: Mapping[str, NDArray[np.int64]]) -> dict[str, SensorHealth]:
     """Return the table from sums of `health_counts`: like `sensor_health`, but without the echoes of the others."""
+    of = {kind: counts[kind] for kind in ('random', 'no_echo', 'missed', 'short')}
+    return _table(
+        names, counts['readings'], of, _of_histograms(counts['ranges']), _of_histograms(counts['short_ranges'])
+    )
+
+
+def _of_histograms(rows: NDArray[np.int64]) -> list[tuple[int, float]]:
+    """Return the `commonest_range` of each row, from a histogram of its ranges."""
     width = round(WINDOW / BIN)
     common = []
-    for row in counts['ranges']:
+    for row in rows:
         held = np.convolve(row, np.ones(width, np.int64), 'valid')
         best = int(held.argmax())
         common.append((int(held[best]), (best + width / 2) * BIN if held[best] else math.nan))
-    of = {kind: counts[kind] for kind in ('random', 'no_echo', 'missed', 'short')}
-    return _table(names, counts['readings'], of, common)
+    return common
 
 
 def _from_free_space(maps: MapSet, sensor: int) -> NDArray[np.bool_]:
@@ -261,7 +277,7 @@ def _verdict(number: int, usual: float, mine: dict[str, float], others: dict[str
     phantoms = mine['random'] >= PHANTOMS * (1.0 - mine['no_echo'])
     if mine['no_echo'] >= SILENT and mine['missed'] >= DEAF and phantoms and above('no_echo'):
         return 'never hears anything'
-    if mine['short'] >= SHORT and mine['same'] >= SAME and above('short'):
+    if mine['short'] >= SHORT and max(mine['same'], mine['alike']) >= SAME and above('short'):
         return 'always short'
     if mine['random'] >= RANDOM and mine['short'] >= CLOSE * mine['random']:
         return 'something moves near it'

@@ -20,6 +20,12 @@ _SILENT_DRIVER = (
     'parameter invalid_range to no_echo'
 )
 
+_BROKEN = (
+    'is the sensor dead or not connected, or is something always in front of it? Repair it, or leave out its topic; '
+    'with invalid_range = no_echo, all space in front of it would be mapped as free'
+)
+"""If it is nearly all readings of a single sensor, they do not stand for 'no echo'."""
+
 REASONS = {
     'nan_range': f'the range is not a number; {_SILENT_DRIVER}',
     'too_near': 'the range is -inf, or less than a millimetre: an object is too near to measure, or the sensor is '
@@ -67,6 +73,11 @@ MANY = 0.2
 NEARLY_ALL, ENOUGH = 0.9, 30
 """Fraction of the readings of one sensor whose rejection for one reason gives a warning, however few they are among
 all; and their least number."""
+
+
+OF_SILENCE, INSTEAD, NONE = ('nan_range', 'too_near', 'below_min_range'), 0.05, 0.01
+"""Reasons for which values that drivers send for 'no echo' are rejected. If at least the first fraction of the readings
+of most sensors is rejected so, and at most the second fraction of all others has no echo, they stand for it."""
 
 
 OF_POSES = {
@@ -181,8 +192,9 @@ def sensor_rejections(
 ) -> list[str]:
     """Return a warning for each reason, other than known ones, for which nearly all readings of a sensor are rejected.
 
-    There is none for reasons that the user chose, for those that are frequent among all readings
-    (`rejection_warnings`), and if no sensor works.
+    There is one as well if those without an echo are rejected, of all sensors: the map lacks their free space. There is
+    none for reasons that the user chose, for those that are frequent among all readings (`rejection_warnings`), and if
+    no sensor works.
 
     Parameters
     ----------
@@ -204,9 +216,37 @@ def sensor_rejections(
         return []
     return [
         f'nearly all readings of {", ".join(sorted(frames)[:8])}{f" and {len(frames) - 8} more" * (len(frames) > 8)} '
-        f'were rejected as {reason}: {REASONS[reason]}'
+        f'were rejected as {reason}: {_BROKEN if reason in OF_SILENCE else REASONS[reason]}'
         for reason, frames in lost.items()
-    ]
+    ] + _instead_of_no_echo(by_frame, accepted, rejected, {*lost, *(each for each in OF_SILENCE if each in known)})
+
+
+def _instead_of_no_echo(
+    by_frame: Mapping[str, Mapping[str, int]],
+    accepted: Mapping[str, tuple[int, int]],
+    rejected: Mapping[str, int],
+    known: Container[str],
+) -> list[str]:
+    """Return a warning if the driver sends a value for 'no echo' that is rejected, even if that happens seldom."""
+    used, silent = (sum(numbers[k] for numbers in accepted.values()) for k in (0, 1))
+    received = used + sum(rejected.values())
+    if silent > NONE * used:
+        return []
+    warnings = []
+    for reason in OF_SILENCE:
+        count = rejected.get(reason, 0)
+        # an object may be too near to some sensors for a while
+        shares = [
+            by_frame.get(frame, {}).get(reason, 0) / (sum(by_frame.get(frame, {}).values()) + numbers[0])
+            for frame, numbers in accepted.items()
+        ]
+        most = sum(share >= INSTEAD for share in shares) > len(shares) / 2
+        if most and max(INSTEAD * received, ENOUGH) <= count <= MANY * received and reason not in known:
+            warnings.append(
+                f'{count} of {received} readings were rejected as {reason}, and no other reading is without an echo: '
+                f'does the driver send this if there is no echo? {_SILENT_DRIVER[0].upper()}{_SILENT_DRIVER[1:]}'
+            )
+    return warnings
 
 
 class Measurements(NamedTuple):

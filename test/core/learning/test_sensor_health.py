@@ -17,6 +17,7 @@ from forward_grid_mapper.core.common.readings import Readings
 from forward_grid_mapper.core.learning.sensor_health import (
     commonest_range,
     first_obstacles,
+    health_counts,
     health_of_counts,
     health_warning,
     sensor_health,
@@ -77,6 +78,22 @@ def test_sensor_that_sees_the_robot_is_found_by_comparison(numbers: tuple[int, i
     assert found[f'sonar_{numbers[2]:02d}'] == 'always short'
 
 
+def test_sensor_that_sees_the_robot_now_and_then_is_found() -> None:
+    """Its other readings are right, so less than `SAME` of all are alike; but its short ones are."""
+    whole = rooms(front=True)
+    always = broken(whole, -1, -1, 4)
+    now_and_then = np.random.default_rng(2).random(len(whole)) < 0.65
+    readings = dataclasses.replace(whole, z=np.where(now_and_then, always.z, whole.z))
+    maps = mapped(readings)
+    table = sensor_health(maps)
+    assert {name: row.verdict_text for name, row in table.items() if row.suspect} == {
+        'sonar_04': 'always short: 0.18 m'
+    }
+    assert table['sonar_04'].same < 0.8 < table['sonar_04'].alike
+    counts = health_counts(maps.readings, maps.forward_model(), maps.ml, maps.unexplained)
+    assert health_of_counts(readings.sensor_names, counts)['sonar_04'].verdict == 'always short'
+
+
 def test_correct_sensors_are_ok() -> None:
     table = sensor_health(mapped(rooms()))
     assert {row.verdict for row in table.values()} == {'ok'}
@@ -127,6 +144,7 @@ def test_sensor_with_few_echoes_is_ok_if_the_map_explains_them(silent: int, rand
         'random': np.array([random, 20, 20]),
         'short': np.zeros(3, np.int64),
         'ranges': ranges,
+        'short_ranges': np.zeros_like(ranges),
     }
     table = health_of_counts(('left', 'front', 'right'), counts)
     assert [row.verdict for row in table.values()] == [verdict, 'ok', 'ok']

@@ -45,7 +45,7 @@ def test_warning_names_a_sensor_with_nearly_all_readings_rejected() -> None:
     fine = {f'sonar_{k}': (100, 20) for k in range(20)}
     by_frame = {'left': {'too_near': 95, 'nan_range': 3}, 'sonar_3': {'too_near': 50}, 'right': {'nan_range': 29}}
     (warning,) = sensor_rejections(by_frame, {**fine, 'left': (2, 0)})
-    assert warning.startswith('nearly all readings of left were rejected as too_near: ') and 'sensor is dead' in warning
+    assert warning.startswith('nearly all readings of left were rejected as too_near: is the sensor dead')
     assert sensor_rejections(by_frame, {**fine, 'left': (20, 0)}) == []
     assert sensor_rejections(by_frame, fine, known={'too_near'}) == []
     # no warning for a frame without name, which has its own reason, nor for a reason that rejected many of all readings
@@ -59,6 +59,23 @@ def test_warning_names_a_sensor_with_nearly_all_readings_rejected() -> None:
     without_stamps = {'zero_stamp': 900}
     assert sensor_rejections({'left': {'too_near': 95}, 'right': without_stamps}, {'left': (2, 0)}) == []
     assert len(sensor_rejections({'left': {'too_near': 95}, 'right': without_stamps}, {'rear': (2, 0)})) == 1
+
+
+def test_warning_of_no_echo_that_is_rejected() -> None:
+    by_frame = {f'sonar_{k}': {'nan_range': 10} for k in range(3)}
+    accepted = {f'sonar_{k}': (90, 0) for k in range(4)}
+    (warning,) = sensor_rejections(by_frame, accepted)
+    assert warning.startswith('30 of 390 readings were rejected as nan_range, and no other reading is without an echo')
+    assert 'set the parameter invalid_range to no_echo' in warning
+    # not if the driver sends max_range or inf for it, if it is reported elsewhere, or if few sensors are concerned
+    assert sensor_rejections(by_frame, {**accepted, 'sonar_3': (90, 9)}) == []
+    assert sensor_rejections(by_frame, accepted, known={'nan_range'}) == []
+    assert sensor_rejections({frame: {'nan_range': 40} for frame in accepted}, accepted) == []
+    assert sensor_rejections({'sonar_0': {'too_near': 30}, 'sonar_1': {'too_near': 30}}, accepted) == []
+    # an object may be too near to a robot that begins to drive
+    assert sensor_rejections({frame: {'too_near': 7} for frame in accepted}, accepted) == []
+    # the pose is missing, or the user does not want these readings
+    assert sensor_rejections({frame: {'pose_gap': 10} for frame in accepted}, accepted) == []
 
 
 def test_reasons_of_poses_are_known_reasons() -> None:
