@@ -123,6 +123,19 @@ def test_damaged_chunk_loses_only_its_own_messages(tmp_path: Path, kind: str, co
     assert len(intact) > COUNT * 0.8
 
 
+def test_damaged_page_loses_only_its_own_messages(tmp_path: Path) -> None:
+    file = storage_file(write_sample(tmp_path, 'sqlite3'))
+    content = bytearray(file.read_bytes())
+    at = len(content) // 2 // 4096 * 4096
+    content[at : at + 4096] = b'\xff' * 4096
+    file.write_bytes(content)
+    messages, truncated = read(file)
+    whole = sample_messages()
+    assert truncated is not None and 'malformed' in truncated
+    assert 0.8 * len(whole) < len(messages) < len(whole)
+    assert messages == [m for m in whole if m in set(messages)] and messages[-1] == whole[-1]
+
+
 @pytest.mark.parametrize(('kind', 'compression'), [('mcap', None), ('mcap', 'storage'), ('ros1', 'bz2')])
 def test_bag_without_index_after_a_kill_is_read(tmp_path: Path, kind: str, compression: str | None) -> None:
     file = storage_file(write_many_chunks(tmp_path, kind, compression))
