@@ -15,6 +15,7 @@ from . import scan_mcap, scan_rosbag1, scan_sqlite3
 from .bounds import LARGEST_METADATA, Budget, bounded, megabytes, most_unpacked
 from .interleaved import interleaved
 from .mcap_chunks import indexed_messages
+from .repair import Problem, reasons_of, remedies_of, repair_hint
 from .salvage import Scan
 from .source import RosbagsSource, Source, one_line
 from .unpacking import NoSpaceError, UnpackedMessages, open_unpacked
@@ -23,11 +24,6 @@ _KINDS: dict[bytes, tuple[str, type[Scan]]] = {
     scan_mcap.MAGIC: ('.mcap', scan_mcap.McapScan),
     scan_sqlite3.MAGIC: ('.db3', scan_sqlite3.Sqlite3Scan),
     scan_rosbag1.MAGIC: ('.bag', scan_rosbag1.Rosbag1Scan),
-}
-_REPAIR = {
-    '.mcap': 'mcap recover {0} -o repaired.mcap',
-    '.db3': 'sqlite3 {0} .recover | sqlite3 repaired.db3',
-    '.bag': 'rosbag reindex {0}',
 }
 _ZSTD_MAGIC = b'\x28\xb5\x2f\xfd'
 
@@ -45,20 +41,19 @@ class _Metadata(NamedTuple):
     compression: str
 
 
-def repair_hint(path: Path) -> str:
-    """Return a hint on the repair of a damaged bag."""
-    if path.is_dir():
-        return f'repair it with `ros2 bag reindex {quoted(path)}`'
-    try:
-        magic = _magic(path)
-    except OSError:  # the suffix is used instead
-        magic = b''
-    suffix = next((kind[0] for key, kind in _KINDS.items() if magic.startswith(key)), path.suffix)
-    command = _REPAIR.get(suffix, 'ros2 bag reindex {0}').format(quoted(path))
-    return f'repair it with `{command}`'
+class Opened(NamedTuple):
+    """The storage files of a bag that could be opened, and the reasons why others could not.
+
+    `sources` are in the order of recording; files whose log times overlap are one source. `files` has the source of
+    each file.
+    """
+
+    sources: list[Source]
+    files: list[tuple[Path, Source]]
+    problems: list[Problem]
 
 
-def open_sources(path: Path) -> tuple[list[Source], str | None]:
+def open_sources(path: Path) -> Opened:
     """Open a bag.
 
     Parameters
@@ -68,10 +63,7 @@ def open_sources(path: Path) -> tuple[list[Source], str | None]:
 
     Returns
     -------
-    sources : list of Source
-        One for each storage file, in the order of recording; one for several files whose log times overlap.
-    damage : str or None
-        The reason why a part of the bag cannot be read.
+    Opened
 
     Raises
     ------
@@ -87,21 +79,24 @@ def open_sources(path: Path) -> tuple[list[Source], str | None]:
             return _open_folder(path)
         if not path.is_file():
             raise BagError(f'{path} is neither a file nor a folder. Give a bag folder or a .mcap, .db3 or .bag file.')
-        return [_open_single(path)], None
+        source = _open_single(path)
+        return Opened([source], [(path, source)], [])
     except BagError:
         raise
     except PermissionError as error:
         raise BagError(f'No permission to read {error.filename or path}. Change its mode or owner.') from None
     except Exception as error:  # OSError, and errors of storage libraries for damaged bytes
-        raise BagError(f'{path} cannot be read ({one_line(error)}); {repair_hint(path)}.') from error
+        hint = '' if path.is_dir() else f'; {repair_hint(path)}'
+        raise BagError(f'{path} cannot be read ({one_line(error)}){hint}.') from error
 
 
-def _open_folder(folder: Path) -> tuple[list[Source], str | None]:
+def _open_folder(folder: Path) -> Opened:
     metadata = _read_metadata(folder)
     present = storage_files(folder)
     if metadata is None:
         if len(present) == 1:
-            return [_open_file(present[0])], None
+            source = _open_file(present[0])
+            return Opened([source], [(present[0], source)], [])
         if present:
             raise BagError(_of_several(folder, present))
         if (folder / 'maps.npz').exists():
@@ -113,12 +108,16 @@ def _open_folder(folder: Path) -> tuple[list[Source], str | None]:
         raise BagError(f'{folder} is not a bag: it has neither metadata.yaml nor a .mcap, .db3 or .bag file.{hint}')
     listed = _without_repetition(_packed_or_not(folder / name) for name in metadata.files)
     there = [p for p in listed if p.exists()]
-    sources, problems = _open_each(there or present, metadata.compression)
-    problems += [f'{p.name} is missing' for p in listed if not p.exists()]
-    problems += [f'{p.name} is not listed in metadata.yaml and was left out' for p in _unlisted(present, there)]
-    if not sources:
-        raise BagError('; '.join(problems) or f'{folder} is an empty bag: metadata.yaml lists no file.')
-    return interleaved(sources), '; '.join(problems) or None
+    files, problems = _open_each(there or present, metadata.compression)
+    copying = f'copy what is missing into {quoted(folder)}'
+    problems += [Problem(f'{p.name} is missing', copying) for p in listed if not p.exists()]
+    listing = f'list all files with `ros2 bag reindex {quoted(folder)}`'
+    unlisted = _unlisted(present, there)
+    problems += [Problem(f'{p.name} is not listed in metadata.yaml and was left out', listing) for p in unlisted]
+    if not files:
+        why = f'{reasons_of(problems)}{remedies_of(problems)}'
+        raise BagError(why or f'{folder} is an empty bag: metadata.yaml lists no file.')
+    return Opened(interleaved([source for _, source in files]), files, problems)
 
 
 def is_storage_file(path: Path) -> bool:
@@ -173,18 +172,18 @@ def _without_repetition(files: Iterable[Path]) -> list[Path]:
     return list(found.values())
 
 
-def _open_each(files: list[Path], compression: str) -> tuple[list[Source], list[str]]:
+def _open_each(files: list[Path], compression: str) -> tuple[list[tuple[Path, Source]], list[Problem]]:
     sources, problems = [], []
     for file in files:
         try:
-            sources.append(_open_listed(file, compression))
+            sources.append((file, _open_listed(file, compression)))
         except BaseException as error:
             # the other files of a split bag are still used
             if isinstance(error, BagError) and not isinstance(error, NoSpaceError):
-                problems.append(str(error).rstrip('.'))
+                problems.append(Problem(str(error).rstrip('.')))
                 continue
             # decompressed files must not remain in the temporary folder
-            for source in sources:
+            for _, source in sources:
                 source.close()
             raise
     return sources, problems

@@ -5,6 +5,7 @@ from __future__ import annotations
 import random
 from collections import Counter
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from itertools import islice, repeat
 from pathlib import Path
 from types import TracebackType
@@ -20,8 +21,9 @@ from .choice import ODOMETRY, RANGE, Topics, choose_range_topics, choose_topics
 from .columns import Columns, InOrder
 from .decoder import TF_MESSAGE, decoder_of
 from .namespaces import by_precedence
-from .opening import open_sources, repair_hint
+from .opening import open_sources
 from .poses import POSES
+from .repair import Problem, reasons_of, remedies_of, repair_hint
 from .source import Channel, RawMessage, Source, one_line
 from .static_transforms import StaticTransforms
 from .transform_chain import TransformChain, chain_of, constant_transforms
@@ -56,7 +58,8 @@ class Bag:
         self.undecodable: dict[str, int] = {}
         self.repeated = RepeatedTopics()
         self._sources: list[Source] = []
-        self._damage: str | None = None
+        self._files: list[tuple[Path, Source]] = []
+        self._problems: list[Problem] = []
 
     def __enter__(self) -> Bag:
         """Open the bag.
@@ -66,26 +69,27 @@ class Bag:
         BagError
             If there is no bag, or nothing of it can be read.
         """
-        self._sources, self._damage = open_sources(self.path)
+        self._sources, self._files, self._problems = open_sources(self.path)
         return self
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         """Close the bag."""
-        self._damage = self._reasons()
+        self._problems = self._found_problems()
         for source in self._sources:
             source.close()
-        self._sources = []
+        self._sources, self._files = [], []
 
     @property
     def truncated(self) -> str | None:
         """One line about what could not be read, complete only after reading; None for an undamaged bag."""
-        reasons = self._reasons()
-        if reasons is None:
+        problems = self._found_problems()
+        if not problems:
             return None
         name = self.path.name or self.path.resolve().name
-        return f'{name} is damaged or cut off ({reasons}); the intact part was read; {repair_hint(self.path)}.'
+        reasons, remedies = reasons_of(problems), remedies_of(problems)
+        return f'{name} is damaged or cut off ({reasons}); the intact part was read{remedies}.'
 
     def topics(self) -> dict[str, tuple[str, int]]:
         """Return (message type, number of messages) by topic; several types are joined by ' | '."""
@@ -108,7 +112,8 @@ class Bag:
         BagError
             If a named topic is missing, or there is none, or several Odometry topics and none is named.
         """
-        return choose_topics(self.topics(), range_topics, odom_topic, self._frames_of, any_poses)
+        with self._naming_damage():
+            return choose_topics(self.topics(), range_topics, odom_topic, self._frames_of, any_poses)
 
     def choose_range_topics(self, range_topics: Sequence[str] | None = None) -> Topics:
         """Return the topics to map from if the poses are from elsewhere: those of ranges, without odometry.
@@ -118,7 +123,18 @@ class Bag:
         BagError
             If a named topic is missing, or there is none.
         """
-        return Topics(choose_range_topics(self.topics(), range_topics), '')
+        with self._naming_damage():
+            return Topics(choose_range_topics(self.topics(), range_topics), '')
+
+    @contextmanager
+    def _naming_damage(self) -> Iterator[None]:
+        """Add the damage to a `BagError`: what is missing may be in the part that cannot be read."""
+        try:
+            yield
+        except BagError as error:
+            if self.truncated is None:
+                raise
+            raise BagError(f'{error}\n{self.truncated}') from error
 
     def base_frame(self) -> str:
         """Return the frame whose pose the bag's odometry gives; '' if there is none."""
@@ -181,10 +197,10 @@ class Bag:
             decoded += len(raw) - len(bad)
             if parts:
                 yield joined(parts)
-        if not decoded and self.truncated:
+        if not decoded and (problems := self._found_problems()):
             raise BagError(
-                f'{self.path} is damaged or cut off ({self._reasons()}) and no message of the chosen topics can be '
-                f'read; {repair_hint(self.path)}.'
+                f'{self.path} is damaged or cut off ({reasons_of(problems)}) and no message of the chosen topics can '
+                f'be read{remedies_of(problems)}.'
             )
 
     def _raw(
@@ -284,9 +300,14 @@ class Bag:
             self.undecodable.pop(topic, None)
         return wanted
 
-    def _reasons(self) -> str | None:
-        reasons = [self._damage, *(source.damage for source in self._sources)]
-        return '; '.join(dict.fromkeys(reason for reason in reasons if reason)) or None
+    def _found_problems(self) -> list[Problem]:
+        """Return what could not be read, as far as known; a file in a bag folder is named."""
+        found = list(self._problems)
+        for file, source in self._files:
+            if source.damage is not None:
+                where = '' if file == self.path else f'{file.name}: '
+                found.append(Problem(f'{where}{source.damage}', repair_hint(file)))
+        return found or [Problem(source.damage) for source in self._sources if source.damage is not None]
 
     def _channels(self) -> Iterator[Channel]:
         if not self._sources:

@@ -1,4 +1,4 @@
-"""Reads a ROS 2 sqlite3 file: undamaged ones in the order of time, damaged ones up to their first damaged page.
+"""Reads a ROS 2 sqlite3 file: an undamaged one by time, a damaged one from both ends to the first damaged page.
 
 SQL can hide endless work in what looks like a table, so only plain tables are read, and the steps of SQLite's virtual
 machine in each pass are bounded by the size of the file.
@@ -10,8 +10,8 @@ import os
 import sqlite3
 import struct
 from collections import Counter
-from collections.abc import Collection, Iterator
-from contextlib import closing
+from collections.abc import Collection, Iterator, Sequence
+from contextlib import closing, suppress
 from pathlib import Path
 from typing import Any
 from urllib.parse import quote
@@ -36,10 +36,9 @@ MOST_TOPICS = 10_000
 """Most topics of a file; further ones are not read."""
 
 _TABLES = ('messages', 'topics', 'message_definitions')
-_ROW = (
-    f"SELECT topic_id, timestamp, CASE WHEN typeof(data) = 'blob' AND length(data) <= {LARGEST_MESSAGE} THEN data END "
-    f'FROM messages NOT INDEXED'
-)
+_COLUMNS = f"topic_id, timestamp, CASE WHEN typeof(data) = 'blob' AND length(data) <= {LARGEST_MESSAGE} THEN data END"
+_ROW = f'SELECT {_COLUMNS} FROM messages NOT INDEXED'
+_NUMBERED_ROW = f'SELECT {_COLUMNS}, rowid FROM messages NOT INDEXED'
 
 
 def has_log(file: Path) -> bool:
@@ -63,7 +62,10 @@ def is_cut(file: Path) -> bool:
 
 
 class Sqlite3Scan(Scan):
-    """Messages of a sqlite3 file; of a damaged one those before the first page that is damaged or missing."""
+    """Messages of a sqlite3 file; of a damaged one those before the first damaged page and those after the last one.
+
+    Of a file that is cut off, those before the first missing page.
+    """
 
     def messages(self, keys: Collection[int]) -> Iterator[RawMessage]:
         """Yield the messages of these channels by log time."""
@@ -101,16 +103,30 @@ class Sqlite3Scan(Scan):
         return super()._count()
 
     def _walk(self) -> Iterator[RawMessage]:
+        last = -(1 << 63)
         try:
             with closing(self._connect()) as database:
                 self._topics(database)
-                for row in database.execute(_ROW):
-                    if _is_message(row):
-                        yield row
-                    else:
-                        self._note('a row is damaged')
+                for row in database.execute(f'{_NUMBERED_ROW} ORDER BY rowid'):
+                    last = row[3]
+                    yield from self._checked(row)
         except (sqlite3.Error, OverflowError, Damage) as error:
             self._note(_reason(error))
+            # an OperationalError is no damaged page, and at the end of a file that is cut off are no messages
+            if isinstance(error, sqlite3.DatabaseError) and not isinstance(error, sqlite3.OperationalError):
+                yield from () if is_cut(self._path) else self._from_the_end(last)
+
+    def _from_the_end(self, first: int) -> Iterator[RawMessage]:
+        """Yield the messages after the row `first` from the last one on, up to a damaged page."""
+        with suppress(sqlite3.Error, OverflowError, Damage), closing(self._connect()) as database:
+            for *row, _ in database.execute(f'{_NUMBERED_ROW} WHERE rowid > ? ORDER BY rowid DESC', (first,)):
+                yield from self._checked(row)
+
+    def _checked(self, row: Sequence[Any]) -> Iterator[RawMessage]:
+        if _is_message(row):
+            yield row[0], row[1], row[2]
+        else:
+            self._note('a row is damaged')
 
     def _connect(self) -> sqlite3.Connection:
         """Open the file for reading.
@@ -182,5 +198,5 @@ def _reason(error: BaseException) -> str:
     return one_line(error)
 
 
-def _is_message(row: tuple[Any, ...]) -> bool:
+def _is_message(row: Sequence[Any]) -> bool:
     return isinstance(row[0], int) and isinstance(row[1], int) and isinstance(row[2], bytes)

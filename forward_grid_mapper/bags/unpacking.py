@@ -11,8 +11,8 @@ from pathlib import Path
 from backports import zstd
 
 from ..core.common.errors import BagError
-from ..core.common.shell import quoted
 from .bounds import LARGEST_MESSAGE, megabytes, most_unpacked, unpack
+from .repair import repair_hint
 from .source import RawMessage, Source, one_line
 
 _PIECE = 1 << 20
@@ -106,10 +106,7 @@ def open_unpacked(file: Path, open_file: Callable[[Path], Source]) -> Source:
             raise
         # users do not know the temporary name
         reason = one_line(error).replace(str(unpacked), 'what it holds')
-        raise BagError(
-            f'{file} is damaged or cut off ({reason}); unpack it with `zstd -d {quoted(file)}`, '
-            f'delete metadata.yaml and run `ros2 bag reindex {quoted(file.parent)}`.'
-        ) from error
+        raise BagError(f'{file} is damaged or cut off ({reason}); {repair_hint(file)}.') from error
 
 
 def _temporary_folder(file: Path) -> Path:

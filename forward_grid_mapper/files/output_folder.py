@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import fcntl
 import itertools
 import os
 import re
@@ -86,9 +87,9 @@ def output_errors(path: Path) -> Iterator[None]:
 def output_folder(path: Path | str) -> Iterator[Path]:
     """Yield a temporary folder to write into, which is renamed to `path` when the block succeeds.
 
-    Before that, nothing exists under the final name, and the temporary folder is removed if the block fails. Missing
-    parents are made. An empty folder that exists already is filled, not replaced: it may be a mount point or the
-    shell's working directory.
+    Before that, nothing exists under the final name, and the temporary folder is removed if the block fails; that of a
+    run that was killed is removed by the next one with the same `path`. Missing parents are made. An empty folder that
+    exists already is filled, not replaced: it may be a mount point or the shell's working directory.
 
     Parameters
     ----------
@@ -103,15 +104,15 @@ def output_folder(path: Path | str) -> Iterator[Path]:
     Raises
     ------
     OutputError
-        If the folder is not empty, cannot be made, or the disk is full.
+        If the folder is not empty, cannot be made, or the disk is full, or if another run writes it now.
     """
     final = Path(os.path.abspath(path))  # noqa: PTH100 (links are kept, so no resolve)
     with output_errors(final):
+        _remove_abandoned(final)
         exists = _is_empty_folder(final)
         made = [] if exists else _make_parents(final.parent)
-        staging = (final if exists else final.parent) / f'.{final.name}.{uuid.uuid4().hex[:8]}.partial'
         try:
-            staging.mkdir()
+            staging, lock = _locked_folder(final, final if exists else final.parent)
         except OSError:
             _remove_empty(made)
             raise
@@ -136,7 +137,60 @@ def output_folder(path: Path | str) -> Iterator[Path]:
     finally:
         if not done:
             shutil.rmtree(staging, ignore_errors=True)
+        os.close(lock)
+        if not done:
+            # NFS keeps a removed folder until it is closed
             _remove_empty(made)
+
+
+def _locked_folder(final: Path, parent: Path) -> tuple[Path, int]:
+    """Make a temporary folder for `final`; return it with a descriptor that holds its lock until it is closed."""
+    while True:
+        staging = parent / f'.{final.name}.{uuid.uuid4().hex[:8]}.partial'
+        staging.mkdir()
+        lock = os.open(staging, os.O_RDONLY | os.O_DIRECTORY)
+        # some network file systems have no locks
+        with suppress(OSError):
+            fcntl.flock(lock, fcntl.LOCK_EX)
+        # another run that began at the same time may have locked it first, and removed it
+        if staging.is_dir():
+            return staging, lock
+        os.close(lock)
+
+
+def _remove_abandoned(final: Path) -> None:
+    """Remove the temporary folders for `final` that runs left when they were killed.
+
+    Raises
+    ------
+    OutputError
+        If one is of a run that still writes.
+    """
+    for parent in (final, final.parent):
+        try:
+            names = os.listdir(parent)  # noqa: PTH208 (names of any bytes, and few of them)
+        except OSError:
+            # not made yet, or not a folder, or the reason why it cannot be written is found next
+            continue
+        for name in names:
+            match = _STAGING.fullmatch(name)
+            if match is None or match['name'] != final.name:
+                continue
+            try:
+                lock = os.open(parent / name, os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW)
+            except OSError:
+                continue
+            try:
+                fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                shutil.rmtree(parent / name, ignore_errors=True)
+            except BlockingIOError:
+                raise OutputError(
+                    f'another run writes {final} now; wait until it has ended, or choose another folder with -o'
+                ) from None
+            except OSError:  # some network file systems have no locks, so it may be in use
+                pass
+            finally:
+                os.close(lock)
 
 
 def free_name(parent: Path | str, stem: str) -> Path:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import errno
 import random
 import shutil
+import subprocess
 import tempfile
 import time
 from pathlib import Path
@@ -16,6 +17,7 @@ from bag_samples import COUNT, SUFFIXES, sample_messages, storage_file, write_ma
 
 from forward_grid_mapper.bags.choice import Topics
 from forward_grid_mapper.bags.reader import Bag
+from forward_grid_mapper.bags.writer import BagWriter
 from forward_grid_mapper.core.common.errors import BagError, MapperError
 from forward_grid_mapper.core.messages.message_types import RangeMessage
 
@@ -121,6 +123,19 @@ def test_damaged_chunk_loses_only_its_own_messages(tmp_path: Path, kind: str, co
     assert len(intact) > COUNT * 0.8
 
 
+def test_damaged_page_loses_only_its_own_messages(tmp_path: Path) -> None:
+    file = storage_file(write_sample(tmp_path, 'sqlite3'))
+    content = bytearray(file.read_bytes())
+    at = len(content) // 2 // 4096 * 4096
+    content[at : at + 4096] = b'\xff' * 4096
+    file.write_bytes(content)
+    messages, truncated = read(file)
+    whole = sample_messages()
+    assert truncated is not None and 'malformed' in truncated
+    assert 0.8 * len(whole) < len(messages) < len(whole)
+    assert messages == [m for m in whole if m in set(messages)] and messages[-1] == whole[-1]
+
+
 @pytest.mark.parametrize(('kind', 'compression'), [('mcap', None), ('mcap', 'storage'), ('ros1', 'bz2')])
 def test_bag_without_index_after_a_kill_is_read(tmp_path: Path, kind: str, compression: str | None) -> None:
     file = storage_file(write_many_chunks(tmp_path, kind, compression))
@@ -168,6 +183,76 @@ def test_unpacked_file_with_metadata_of_a_compressed_one_is_read(tmp_path: Path,
     assert read(bag) == (sample_messages(), None)
     metadata.unlink()
     assert read(bag) == (sample_messages(), None)
+
+
+def split_in_two(folder: Path) -> tuple[Path, Path, Path]:
+    """Write a bag with the same messages in two files; return the folder and its files."""
+    bag = write_sample(folder, 'mcap')
+    file = storage_file(bag)
+    second = shutil.copy(file, bag / 'bag_1.mcap')
+    metadata = bag / 'metadata.yaml'
+    metadata.write_text(metadata.read_text().replace('- bag.mcap', '- bag.mcap\n  - bag_1.mcap', 1))
+    return bag, file, second
+
+
+def test_remedy_fits_the_damage(tmp_path: Path) -> None:
+    bag, _, second = split_in_two(tmp_path)
+    content = second.read_bytes()
+    second.write_bytes(content[: len(content) // 2])
+    _, truncated = read(bag)
+    # an index made again would not change the file
+    assert truncated is not None and f'mcap recover {second} -o' in truncated and 'reindex' not in truncated
+    assert 'bag_1.mcap: the file is cut off' in truncated
+    second.write_bytes(b'')
+    _, truncated = read(bag)
+    assert truncated is not None and 'bag_1.mcap is empty' in truncated
+    assert 'reindex' not in truncated and 'recover' not in truncated
+    second.unlink()
+    _, truncated = read(bag)
+    assert (
+        truncated is not None
+        and 'bag_1.mcap is missing' in truncated
+        and f'copy what is missing into {bag}' in truncated
+    )
+    assert 'reindex' not in truncated and 'recover' not in truncated
+
+
+@pytest.mark.skipif(not shutil.which('sqlite3'), reason='needs sqlite3')
+def test_remedy_for_a_sqlite3_file_repairs_it(tmp_path: Path) -> None:
+    file = storage_file(write_sample(tmp_path, 'sqlite3'))
+    file.write_bytes(file.read_bytes()[: file.stat().st_size * 7 // 10])
+    kept, truncated = read(file)
+    assert truncated is not None
+    command = truncated.split('`')[1]
+    subprocess.run(command, shell=True, cwd=tmp_path, capture_output=True, check=True)
+    repaired, truncated = read(tmp_path / 'repaired.db3')
+    assert truncated is None and len(kept) > COUNT // 2 and set(kept) <= set(repaired)
+
+
+def test_remedy_for_a_compressed_file_unpacks_it_first(tmp_path: Path) -> None:
+    bag = packed_and_split(tmp_path)
+    file, plain = bag / 'bag_0.mcap.zstd', bag / 'bag_0.mcap'
+    file.write_bytes(file.read_bytes()[: file.stat().st_size // 2])
+    messages, truncated = read(bag)
+    assert messages == sample_messages() and truncated is not None
+    # without -c, zstd deletes what it could unpack
+    assert f'`zstd -dc {file} > {plain}`, and repair it with `mcap recover {plain} -o repaired.mcap`' in truncated
+    assert 'reindex' not in truncated
+
+
+def test_missing_topic_is_reported_with_the_damage(tmp_path: Path) -> None:
+    bag, first, second = split_in_two(tmp_path)
+    first.unlink()
+    with BagWriter(tmp_path / 'other', 'mcap') as writer:
+        writer.write_range('/sonar', next(m for m in sample_messages() if isinstance(m, RangeMessage)))
+    storage_file(tmp_path / 'other').replace(second)
+    with Bag(bag) as opened:
+        with pytest.raises(
+            BagError, match=r'(?s)no nav_msgs/Odometry.*bag\.mcap is missing.*copy what is missing into'
+        ):
+            opened.choose_topics()
+        with pytest.raises(BagError, match=r"(?s)no topic '/left'.*bag\.mcap is missing"):
+            opened.choose_range_topics(['/left'])
 
 
 def test_compressed_file_without_metadata_is_rejected_with_a_remedy(tmp_path: Path) -> None:

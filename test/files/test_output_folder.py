@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import fcntl
 import os
 from pathlib import Path
 
@@ -49,6 +50,44 @@ def test_existing_empty_folder_is_filled(tmp_path: Path, monkeypatch: pytest.Mon
     fill(Path())
     assert names_in(tmp_path) == ['a.txt', 'sub']
     assert tmp_path.stat().st_ino == inode
+
+
+@pytest.mark.parametrize('exists', [False, True])
+def test_second_run_is_refused_at_once(tmp_path: Path, exists: bool) -> None:
+    maps = tmp_path / 'maps'
+    if exists:
+        maps.mkdir()
+    with output_folder(maps) as folder:
+        (folder / 'a.txt').write_text('a')
+        with pytest.raises(OutputError, match=r'another run writes .*maps now; wait until .* another folder with -o'):
+            fill(maps)
+        fill(tmp_path / 'others')
+    assert names_in(maps) == ['a.txt'] and names_in(tmp_path) == ['maps', 'others']
+
+
+@pytest.mark.parametrize('exists', [False, True])
+def test_rest_of_a_killed_run_is_removed(tmp_path: Path, exists: bool) -> None:
+    maps = tmp_path / 'maps'
+    if exists:
+        maps.mkdir()
+    killed = (maps if exists else tmp_path) / '.maps.0123abcd.partial'
+    killed.mkdir()
+    (killed / 'live_map.pgm').write_text('half of')
+    other = tmp_path / '.other.0123abcd.partial'
+    other.mkdir()
+    fill(maps)
+    assert names_in(maps) == ['a.txt', 'sub'] and names_in(tmp_path) == [other.name, 'maps']
+
+
+def test_file_system_without_locks_is_written(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def flock(*_: object) -> None:
+        raise OSError(errno.ENOLCK, 'No locks available')
+
+    monkeypatch.setattr(fcntl, 'flock', flock)
+    kept = tmp_path / '.maps.0123abcd.partial'
+    kept.mkdir()
+    fill(tmp_path / 'maps')
+    assert names_in(tmp_path) == [kept.name, 'maps']
 
 
 def test_folder_that_is_not_empty_is_rejected(tmp_path: Path) -> None:
