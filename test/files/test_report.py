@@ -116,7 +116,8 @@ def test_many_random_readings_give_a_hint_to_refine_poses() -> None:
     ):
         some = dataclasses.replace(maps, unexplained=np.arange(200) < part)
         text = ' '.join(report_text(report_data(some, source)).split())
-        assert (f'many, as with odometry that drifts ({option}), or wrong poses of sensors' in text) == (option is not None)
+        hint = f'many, as with odometry that drifts ({option}), or wrong poses of sensors'
+        assert (hint in text) == (option is not None)
         assert ('many, as' in text) == (option is not None)
 
 
