@@ -49,6 +49,9 @@ PHANTOMS = 0.5
 """At least this fraction of its few echoes is random."""
 SHORT = 0.5
 RANDOM = 0.5
+OFTEN = 0.3
+"""A sensor with others to compare with is suspect from this fraction of random readings on: with a wrong pose, the walls
+along which the robot drives still explain many."""
 SAME, WINDOW = 0.8, 0.2
 """A sensor that repeats one range has at least this fraction of its readings, or of its short readings, within so many
 metres: it may hear its robot only now and then."""
@@ -68,7 +71,7 @@ class SensorHealth:
 
     `common` is the mean (the middle, from counts) of the most frequent 0.2 m of range, metres; that of the short
     readings, if these are alike. `verdict` is 'ok', 'few readings', 'something moves near it', 'never hears anything',
-    'always short' or 'mostly random'.
+    'always short', 'mostly random' or 'often random'.
     """
 
     readings: int
@@ -84,7 +87,7 @@ class SensorHealth:
     @property
     def suspect(self) -> bool:
         """Whether the sensor seems to be broken, badly mounted or given a wrong pose."""
-        return self.verdict in ('never hears anything', 'always short', 'mostly random')
+        return self.verdict in ('never hears anything', 'always short', 'mostly random', 'often random')
 
     @property
     def verdict_text(self) -> str:
@@ -279,11 +282,12 @@ def _verdict(number: int, usual: float, mine: dict[str, float], others: dict[str
         return 'never hears anything'
     if mine['short'] >= SHORT and max(mine['same'], mine['alike']) >= SAME and above('short'):
         return 'always short'
-    if mine['random'] >= RANDOM and mine['short'] >= CLOSE * mine['random']:
+    often = mine['random'] >= OFTEN and math.isfinite(others['random']) and above('random')
+    if (often or mine['random'] >= RANDOM) and mine['short'] >= CLOSE * mine['random']:
         return 'something moves near it'
     if mine['random'] >= RANDOM and above('random'):
         return 'mostly random'
-    return 'ok'
+    return 'often random' if often else 'ok'
 
 
 def health_warning(table: dict[str, SensorHealth]) -> str:

@@ -94,6 +94,15 @@ def test_sensor_that_sees_the_robot_now_and_then_is_found() -> None:
     assert health_of_counts(readings.sensor_names, counts)['sonar_04'].verdict == 'always short'
 
 
+@pytest.mark.parametrize(('front', 'sensor'), [(False, 5), (True, 3)])
+def test_sensor_with_a_wrong_pose_is_named(front: bool, sensor: int) -> None:
+    """The walls along which the robot drives still explain half of its readings."""
+    readings = rooms(front)
+    turned = readings.yaw + np.where(readings.sensor == sensor, math.radians(20.0), 0.0)
+    found = suspects(dataclasses.replace(readings, yaw=turned))
+    assert found == {readings.sensor_names[sensor]: 'often random'}
+
+
 def test_correct_sensors_are_ok() -> None:
     table = sensor_health(mapped(rooms()))
     assert {row.verdict for row in table.values()} == {'ok'}
