@@ -50,8 +50,8 @@ PHANTOMS = 0.5
 SHORT = 0.5
 RANDOM = 0.5
 OFTEN = 0.3
-"""A sensor with others to compare with is suspect from this fraction of random readings on: with a wrong pose, the walls
-along which the robot drives still explain many."""
+"""A sensor with others to compare with is suspect from this fraction of random readings on: if its pose is wrong, the
+walls along which the robot drives still explain many."""
 SAME, WINDOW = 0.8, 0.2
 """A sensor that repeats one range has at least this fraction of its readings, or of its short readings, within so many
 metres: it may hear its robot only now and then."""
