@@ -63,6 +63,10 @@ driving."""
 TURNED = 0.5
 """The robot must have turned by so many radians as well: along a straight wall, a range may stay the same for long."""
 
+STOPPED, PAUSES = 10.0, 3.0
+"""A sensor stopped if others sent readings for so many seconds after its last one, and for so many times its longest
+pause before."""
+
 FASTEST = 15.0
 """No robot with sonars drives so many metres a second; 0.2 m/s in centimetres look like 20 m/s."""
 
@@ -85,7 +89,7 @@ def input_warnings(readings: Readings) -> list[str]:
         # the other checks compare readings in their order
         return [text]
     by_time = readings.select(np.argsort(readings.stamp, kind='stable'))
-    checks = (_copies, _shared_frame, _speed, _standing, _stuck, _extent)
+    checks = (_copies, _shared_frame, _speed, _standing, _stuck, _stopped, _extent)
     return [*(text for check in checks if (text := check(by_time))), *range_warnings(by_time)]
 
 
@@ -221,6 +225,23 @@ def _stuck(readings: Readings) -> str:
     return (
         f'sensor {_listed(suspects)} gives the same range everywhere: is it broken, or does it hear a part of the '
         'robot? Repair it, or leave out its topic'
+    )
+
+
+def _stopped(readings: Readings) -> str:
+    """Check for sensors without readings in the last part of a drive, in which others have some."""
+    missing: dict[str, float] = {}
+    for drive in np.unique(readings.drive):
+        together = readings.select(readings.drive == drive)
+        for name, mine in sensors(together):
+            rest = float(together.stamp[-1] - mine.stamp[-1]) / 1e9
+            if rest >= max(STOPPED, PAUSES * float(np.diff(mine.stamp).max()) / 1e9):
+                missing[name] = max(rest, missing.get(name, 0.0))
+    if not missing:
+        return ''
+    return (
+        f'in the last {max(missing.values()):.0f} s of a drive there are no readings of {_listed(list(missing))}, but '
+        'of others: was a sensor unplugged, or did its driver stop?'
     )
 
 

@@ -66,6 +66,12 @@ def warnings_of(messages: Messages) -> list[str]:
     return [*associator.limits.warnings(), *input_warnings(associator.readings)]
 
 
+def stopped(frame: str) -> Messages:
+    """The drive in circles, with a sensor that sends nothing in its second half."""
+    half = circling().ranges[-1].stamp // 2
+    return circling()._replace(ranges=[m for m in circling().ranges if m.frame_id != frame or m.stamp < half])
+
+
 def scaled(range_by: float, limits_by: float) -> Messages:
     return drive().with_ranges(
         lambda m: m._replace(
@@ -167,6 +173,10 @@ SCENARIOS: dict[str, tuple[Callable[[], Messages], str]] = {
     'poses in centimetres': (lambda: moved_by(100), r'poses move at \d+ m/s: are they in millimetres or centimetres'),
     'a sensor at 1.2 m': (lambda: stuck(2, 1.2345), r'gives the same range.*Repair it'),
     'a sensor at 0.2 m': (lambda: stuck(5, 0.2), r'sensor \S+ \(0\.200 m\) gives the same range'),
+    'a sensor stops halfway': (
+        lambda: stopped('sonar_3'),
+        r'in the last 30 s of a drive .* no readings of sonar_3, but',
+    ),
     'field of view of 1 degree': (
         lambda: drive().with_ranges(lambda m: m._replace(field_of_view=math.radians(1))),
         r'field of view is 1 degrees.*set the parameter field_of_view',
@@ -313,6 +323,13 @@ def test_robot_at_standstill_with_people_gives_no_warning() -> None:
         for n, frame in enumerate(frames)
     ]
     assert warnings_of(Messages(drive().extrinsics, odometry, ranges)) == []
+
+
+def test_sensor_that_paused_before_may_pause_at_the_end() -> None:
+    def kept(message: RangeMessage) -> bool:
+        return message.frame_id != 'sonar_3' or not (5 < message.stamp / 1e9 < 20 or message.stamp / 1e9 > 45)
+
+    assert warnings_of(circling()._replace(ranges=[m for m in circling().ranges if kept(m)])) == []
 
 
 def test_robot_that_drives_in_circles_gives_no_warning() -> None:
