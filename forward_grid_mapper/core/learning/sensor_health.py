@@ -14,6 +14,9 @@ of less than half of the usual one of the others, a live map of the others' echo
 this is free is short, too. Their max-range readings do not count: in a corridor of smooth walls, sensors that look
 along it meet its walls at a slant and get no echo, while those at the sides hear them at one range all the time.
 
+A parked robot repeats a range for as long as it stands, so the fractions of the places with such readings must be
+suspect as well.
+
 Fractions are compared with those of the other sensors, since all have no echoes in a hall of smooth walls, and all have
 random ones in a crowd. A fraction is suspect if it is large *and* well above the median of the others.
 """
@@ -35,6 +38,8 @@ from ..runtime.jit import kernel
 from ..sensor.cone import make_cone, rows_of, runs_of
 from ..sensor.forward_model import ForwardModel
 
+FRACTIONS = ('random', 'no_echo', 'missed', 'short')
+"""Counts by sensor of which the table has the fractions."""
 NEAR = 0.5
 """A random echo is short if it is nearer than this fraction of the distance to the first obstacle."""
 REACH = 0.75
@@ -59,6 +64,9 @@ CLOSE = 0.7
 """If at least this fraction of the random readings is short, but not at one range, a person moves near the sensor."""
 BIN, BINS = 0.05, 400
 """Size, metres, and number of the bins of ranges, if readings are counted in portions."""
+PLACE = 0.1
+"""Metres, and radians, from one place to the next. The fraction of the places with such readings must be as large,
+since whatever stands near a parked robot is no fault of its sensors."""
 ABOVE = 0.25
 """A suspect fraction is at least this much above the median of the others."""
 FREE = 0.35
@@ -165,7 +173,7 @@ def sensor_health(maps: MapSet) -> dict[str, SensorHealth]:
             marks['short'] |= _from_free_space(maps, k)
     counts = {kind: np.bincount(readings.sensor, weights=mark, minlength=count)[:count] for kind, mark in marks.items()}
     near = [commonest_range(readings.z[marks['short'] & (readings.sensor == k)]) for k in range(count)]
-    return _table(readings.sensor_names, numbers, counts, common, near)
+    return _table(readings.sensor_names, numbers, counts | _places(readings, marks), common, near)
 
 
 def _marks(readings: Readings, obstacle: Floats, unexplained: NDArray[np.bool_]) -> dict[str, NDArray[np.bool_]]:
@@ -179,6 +187,17 @@ def _marks(readings: Readings, obstacle: Floats, unexplained: NDArray[np.bool_])
     }
 
 
+def _places(readings: Readings, marks: Mapping[str, NDArray[np.bool_]]) -> dict[str, NDArray[np.int64]]:
+    """Return from how many places and directions each sensor has readings, random and short ones, shape (S,)."""
+    poses = np.column_stack([readings.sensor, *(np.floor(v / PLACE) for v in (readings.x, readings.y, readings.yaw))])
+    out = {}
+    every = np.ones(len(readings), np.bool_)
+    for kind, mine in (('places', every), ('places_random', marks['random']), ('places_short', marks['short'])):
+        different = np.unique(poses[mine], axis=0)[:, 0].astype(np.int64)
+        out[kind] = np.bincount(different, minlength=len(readings.sensor_names))
+    return out
+
+
 def _table(
     names: tuple[str, ...],
     numbers: NDArray[np.int64],
@@ -188,7 +207,8 @@ def _table(
 ) -> dict[str, SensorHealth]:
     """Return the table from counts by sensor, shape (S,), and `commonest_range` of each and of its short readings."""
     with np.errstate(invalid='ignore'):
-        shares: dict[str, Floats] = {kind: column / numbers for kind, column in counts.items()}
+        shares: dict[str, Floats] = {kind: counts[kind] / numbers for kind in FRACTIONS}
+        shares |= {kind: counts[kind] / counts['places'] for kind in ('places_random', 'places_short')}
         shares['same'] = np.array([held for held, _ in common], np.float64) / numbers
         shares['alike'] = np.array([held for held, _ in near], np.float64) / counts['short']
     made = {}
@@ -198,7 +218,8 @@ def _table(
         usual = _median(np.delete(numbers, k).astype(np.float64))
         verdict = _verdict(int(numbers[k]), usual, mine, others)
         middle = near[k][1] if mine['alike'] >= SAME else common[k][1]
-        made[name] = SensorHealth(int(numbers[k]), **mine, common=middle, verdict=verdict)
+        columns = {kind: mine[kind] for kind in (*FRACTIONS, 'same', 'alike')}
+        made[name] = SensorHealth(int(numbers[k]), **columns, common=middle, verdict=verdict)
     return made
 
 
@@ -216,6 +237,7 @@ def health_counts(
     size = len(readings.sensor_names)
     marks = _marks(readings, first_obstacles(forward, ml), unexplained)
     counts = {kind: np.bincount(readings.sensor[mark], minlength=size) for kind, mark in marks.items()}
+    counts |= _places(readings, marks)
     counts['readings'] = np.bincount(readings.sensor, minlength=size)
     for kind, chosen in (('ranges', readings.echo), ('short_ranges', marks['short'])):
         counts[kind] = np.zeros((size, BINS), np.int64)
@@ -226,9 +248,8 @@ def health_counts(
 
 def health_of_counts(names: tuple[str, ...], counts: Mapping[str, NDArray[np.int64]]) -> dict[str, SensorHealth]:
     """Return the table from sums of `health_counts`: like `sensor_health`, but without the echoes of the others."""
-    of = {kind: counts[kind] for kind in ('random', 'no_echo', 'missed', 'short')}
     return _table(
-        names, counts['readings'], of, _of_histograms(counts['ranges']), _of_histograms(counts['short_ranges'])
+        names, counts['readings'], counts, _of_histograms(counts['ranges']), _of_histograms(counts['short_ranges'])
     )
 
 
@@ -280,12 +301,13 @@ def _verdict(number: int, usual: float, mine: dict[str, float], others: dict[str
     phantoms = mine['random'] >= PHANTOMS * (1.0 - mine['no_echo'])
     if mine['no_echo'] >= SILENT and mine['missed'] >= DEAF and phantoms and above('no_echo'):
         return 'never hears anything'
-    if mine['short'] >= SHORT and max(mine['same'], mine['alike']) >= SAME and above('short'):
+    repeats = max(mine['same'], mine['alike']) >= SAME
+    if min(mine['short'], mine['places_short']) >= SHORT and repeats and above('short'):
         return 'always short'
-    often = mine['random'] >= OFTEN and math.isfinite(others['random']) and above('random')
+    often = min(mine['random'], mine['places_random']) >= OFTEN and math.isfinite(others['random']) and above('random')
     if (often or mine['random'] >= RANDOM) and mine['short'] >= CLOSE * mine['random']:
         return 'something moves near it'
-    if mine['random'] >= RANDOM and above('random'):
+    if min(mine['random'], mine['places_random']) >= RANDOM and above('random'):
         return 'mostly random'
     return 'often random' if often else 'ok'
 

@@ -110,6 +110,28 @@ def test_correct_sensors_are_ok() -> None:
     assert all(row.random < 0.2 for row in table.values())
 
 
+@pytest.mark.parametrize('broken_too', [False, True])
+def test_something_beside_a_parked_robot_is_no_fault(broken_too: bool) -> None:
+    """It stands where the robot drove before, so no map can explain its echoes; the robot is parked for hours."""
+    readings = rooms()
+    last = readings.select(np.flatnonzero(readings.stamp > readings.stamp.max() - 50_000_000))
+    behind = last.sensor_names.index('sonar_12')
+    seen = dataclasses.replace(last, z=np.where(last.sensor == behind, 0.3, last.z))
+    parked = [dataclasses.replace(seen, stamp=seen.stamp + k * 10**8) for k in range(1, 2000)]
+    columns = (field.name for field in dataclasses.fields(Readings) if field.name != 'sensor_names')
+    all_of = {name: np.concatenate([getattr(r, name) for r in (readings, *parked)]) for name in columns}
+    whole = dataclasses.replace(readings, **all_of)
+    if broken_too:
+        whole = dataclasses.replace(whole, z=np.where(whole.sensor == 4, 0.18, whole.z))
+    maps = mapped(whole)
+    counts = health_counts(maps.readings, maps.forward_model(), maps.ml, maps.unexplained)
+    of_counts = health_of_counts(whole.sensor_names, counts)
+    table = sensor_health(maps)
+    assert table['sonar_12'].short > 0.9 and of_counts['sonar_12'].short > 0.9
+    assert not any(row.suspect for name, row in of_counts.items() if name != 'sonar_04')
+    assert [name for name, row in table.items() if row.suspect] == (['sonar_04'] if broken_too else [])
+
+
 @pytest.mark.parametrize('heading', [0.0, 0.2, 0.4, 2.0])
 def test_sensors_beside_smooth_walls_are_not_short(heading: float) -> None:
     """They hear the walls of a corridor at one range all the time; those that look ahead never do."""
@@ -152,6 +174,9 @@ def test_sensor_with_few_echoes_is_ok_if_the_map_explains_them(silent: int, rand
         'missed': np.array([800, 0, 0]),
         'random': np.array([random, 20, 20]),
         'short': np.zeros(3, np.int64),
+        'places': np.full(3, 10),
+        'places_random': np.full(3, 2),
+        'places_short': np.zeros(3, np.int64),
         'ranges': ranges,
         'short_ranges': np.zeros_like(ranges),
     }
