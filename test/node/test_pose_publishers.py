@@ -167,7 +167,9 @@ def test_one_stamp_from_the_future_is_not_published_to_tf(
     assert max(map(seconds_of, sent)) < 111.0
     assert len(sent) == 99
     assert robot.node.trajectory.driven == pytest.approx(4.95)
-    robot.until(lambda: path and len(path[-1].stamp) > 90)
+    # on a busy machine, a path is still in work when the next one is due
+    behind = trajectory.PATH_EVERY / 0.05
+    robot.until(lambda: tick() or (path and len(path[-1].stamp) > 98 - behind))
     assert path[-1].stamp[0] == 100 * 10**9 and len(path[-1].stamp) < 100
     # if it lasts, it is used, and taken back if it was wrong
     robot.odometry(1000.0, 5.0)
