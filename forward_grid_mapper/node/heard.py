@@ -46,8 +46,11 @@ class Heard:
         now = time.monotonic()
         gap, self._newest = now - self._newest, now
         if gap > TIME_OUT and gap > self.patience:
-            # after a pause of all sensors, the others are not silent because one of them is the first
-            self._sensors = {known: (last + gap, usual) for known, (last, usual) in self._sensors.items()}
+            # after a pause of all sensors, the others are not silent because one of them is the first; a sensor whose
+            # interval is not known yet may send as rarely
+            for known, (last, usual) in self._sensors.items():
+                if usual and known != frame:
+                    self._sensors[known] = last + gap, usual
         before = self._sensors.get(frame)
         if before is not None:
             last, interval = before

@@ -97,6 +97,20 @@ def test_sensor_that_sends_rarely_has_a_longer_limit(clock: Clock) -> None:
     assert sensors.silent() == {} and 'slow' not in sensors
 
 
+def test_interval_of_sensors_that_all_send_rarely_is_learned(clock: Clock) -> None:
+    """Their first intervals are no pauses, and one that stops is silent."""
+    sensors = Heard()
+    for k in range(20):
+        clock.now = 500.0 + 5.0 * k
+        sensors.note('left')
+        clock.now += 0.1
+        if k < 10:
+            sensors.note('right')
+        assert ('right' in sensors.silent()) == (k >= 15)
+        assert 'left' not in sensors.silent()
+    assert sensors.patience == pytest.approx(5 * USUAL, rel=0.1)
+
+
 def test_unprintable_names_and_too_many_are_ignored(clock: Clock) -> None:
     sensors = Heard()
     for name in ('', 'a\nb', 'x' * 256, *(f'made up {k}' for k in range(2 * heard.MOST_FRAMES))):
