@@ -239,6 +239,8 @@ def _instead_of_no_echo(
         shares = [
             by_frame.get(frame, {}).get(reason, 0) / (sum(by_frame.get(frame, {}).values()) + numbers[0])
             for frame, numbers in accepted.items()
+            # a sensor of which all readings were left out is known, but has no count
+            if numbers[0] or by_frame.get(frame)
         ]
         most = sum(share >= INSTEAD for share in shares) > len(shares) / 2
         if most and max(INSTEAD * received, ENOUGH) <= count <= MANY * received and reason not in known:

@@ -67,6 +67,8 @@ def test_warning_of_no_echo_that_is_rejected() -> None:
     (warning,) = sensor_rejections(by_frame, accepted)
     assert warning.startswith('30 of 390 readings were rejected as nan_range, and no other reading is without an echo')
     assert 'set the parameter invalid_range to no_echo' in warning
+    # sensors without any reading do not count
+    assert sensor_rejections(by_frame, {**accepted, **{f'idle_{k}': (0, 0) for k in range(9)}}) == [warning]
     # not if the driver sends max_range or inf for it, if it is reported elsewhere, or if few sensors are concerned
     assert sensor_rejections(by_frame, {**accepted, 'sonar_3': (90, 9)}) == []
     assert sensor_rejections(by_frame, accepted, known={'nan_range'}) == []
