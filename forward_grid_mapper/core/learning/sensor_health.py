@@ -190,11 +190,17 @@ def _marks(readings: Readings, obstacle: Floats, unexplained: NDArray[np.bool_])
 def _places(readings: Readings, marks: Mapping[str, NDArray[np.bool_]]) -> dict[str, NDArray[np.int64]]:
     """Return from how many places and directions each sensor has readings, random and short ones, shape (S,)."""
     poses = np.column_stack([readings.sensor, *(np.floor(v / PLACE) for v in (readings.x, readings.y, readings.yaw))])
+    # sorted once, by columns, since np.unique takes seconds for a million rows
+    order = np.lexsort(poses.T)
+    poses = poses[order]
+    other = (poses[1:] != poses[:-1]).any(axis=1)
+    place = np.concatenate([np.zeros(min(len(poses), 1), np.int64), np.cumsum(other)])
+    sensor = poses[np.flatnonzero(np.diff(place, prepend=-1)), 0].astype(np.int64)
     out = {}
     every = np.ones(len(readings), np.bool_)
     for kind, mine in (('places', every), ('places_random', marks['random']), ('places_short', marks['short'])):
-        different = np.unique(poses[mine], axis=0)[:, 0].astype(np.int64)
-        out[kind] = np.bincount(different, minlength=len(readings.sensor_names))
+        there = np.bincount(place[mine[order]], minlength=len(sensor)) > 0
+        out[kind] = np.bincount(sensor[there], minlength=len(readings.sensor_names))
     return out
 
 
