@@ -148,11 +148,14 @@ def _locked_folder(final: Path, parent: Path) -> tuple[Path, int]:
     while True:
         staging = parent / f'.{final.name}.{uuid.uuid4().hex[:8]}.partial'
         staging.mkdir()
-        lock = os.open(staging, os.O_RDONLY | os.O_DIRECTORY)
+        # another run that began at the same time may lock it first, and remove it
+        try:
+            lock = os.open(staging, os.O_RDONLY | os.O_DIRECTORY)
+        except FileNotFoundError:
+            continue
         # some network file systems have no locks
         with suppress(OSError):
             fcntl.flock(lock, fcntl.LOCK_EX)
-        # another run that began at the same time may have locked it first, and removed it
         if staging.is_dir():
             return staging, lock
         os.close(lock)
