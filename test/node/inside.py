@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import os
+import sys
+import threading
 import time
+import traceback
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
@@ -59,12 +62,25 @@ class Inside:
         return self
 
     def until(self, condition: Callable[[], Any], seconds: float = 200.0) -> Any:
-        """Turn the executor until the condition holds."""
-        end = time.monotonic() + seconds
+        """Turn the executor until the condition holds; a second counts at most for each turn, if the machine stalls."""
+        left, before = seconds, time.monotonic()
         while not (value := condition()):
-            assert time.monotonic() < end, f'it did not happen: {condition}'
+            now = time.monotonic()
+            left, before = left - min(now - before, 1.0), now
+            assert left > 0.0, f'it did not happen: {condition}\n{self._state()}'
             self.executor.spin_once(timeout_sec=0.01)
         return value
+
+    def _state(self) -> str:
+        """Return what the node does, and where each of its threads is."""
+        names = {thread.ident: thread.name for thread in threading.enumerate()}
+        stacks = [
+            f'{names.get(number, number)}:\n{"".join(traceback.format_stack(frame, limit=-12))}'
+            for number, frame in sys._current_frames().items()
+            if number != threading.get_ident()
+        ]
+        em = self.node.em
+        return '\n'.join([f'EM: {em.current}; last run: {em.last_run}; intake busy: {self.node.intake.busy}', *stacks])
 
     def spin(self, seconds: float) -> None:
         """Turn the executor for some seconds."""
