@@ -58,15 +58,16 @@ class UnpackedMessages:
 
 
 class _InFolder:
-    """A source in a temporary folder, which is deleted with it."""
+    """A source in a temporary folder, which is deleted with it; `cut` is why the source is not complete, or None."""
 
-    def __init__(self, source: Source, folder: Path) -> None:
-        self._source, self._folder = source, folder
+    def __init__(self, source: Source, folder: Path, cut: str | None) -> None:
+        self._source, self._folder, self._cut = source, folder, cut
         self.channels, self.span = source.channels, source.span
 
     @property
     def damage(self) -> str | None:
-        return self._source.damage
+        # what the source itself lacks follows from it
+        return self._cut or self._source.damage
 
     @damage.setter
     def damage(self, damage: str | None) -> None:
@@ -83,20 +84,22 @@ class _InFolder:
 def open_unpacked(file: Path, open_file: Callable[[Path], Source]) -> Source:
     """Decompress a storage file, such as bag_0.db3.zstd, into a temporary folder and open it there.
 
+    Of a file that is damaged or cut off, the part before the damage is read.
+
     Raises
     ------
     NoSpaceError
         If it does not fit into the temporary folder.
     BagError
-        Naming the file, if it is damaged, or larger than allowed when decompressed.
+        Naming the file, if nothing of it can be read, or if it is larger than allowed when decompressed.
     """
     if not file.is_file():
         raise BagError(f'{file} is not a regular file; give a bag folder or a .mcap, .db3 or .bag file.')
     folder = _temporary_folder(file)
     try:
         unpacked = folder / file.stem
-        _unpack(file, unpacked)
-        return _InFolder(open_file(unpacked), folder)
+        cut = _unpack(file, unpacked)
+        return _InFolder(open_file(unpacked), folder, cut)
     except (PermissionError, NoSpaceError):
         shutil.rmtree(folder, ignore_errors=True)
         raise
@@ -119,12 +122,27 @@ def _temporary_folder(file: Path) -> Path:
         ) from error
 
 
-def _unpack(packed: Path, unpacked: Path) -> None:
+def _unpack(packed: Path, unpacked: Path) -> str | None:
+    """Decompress a file; return why only its beginning could be decompressed, or None.
+
+    Raises
+    ------
+    NoSpaceError
+        If there is not enough space.
+    BagError
+        If it is larger than allowed.
+    Exception
+        Of the library, if nothing could be decompressed.
+    """
     most, free = most_unpacked(packed.stat().st_size), shutil.disk_usage(unpacked.parent).free
     done = 0
     try:
         with zstd.open(packed, 'rb') as source, unpacked.open('wb') as target:
-            while piece := source.read(_PIECE):
+            while piece := _piece(source):
+                if isinstance(piece, Exception):
+                    if not done:
+                        raise piece
+                    return one_line(piece)
                 done += len(piece)
                 if done > most:
                     raise BagError(f'it unpacks to more than {megabytes(most)}')
@@ -135,6 +153,16 @@ def _unpack(packed: Path, unpacked: Path) -> None:
         if error.errno not in NO_SPACE:
             raise
         raise _no_space(packed, free) from error
+    return None
+
+
+def _piece(source: zstd.ZstdFile) -> bytes | Exception:
+    """Return the next decompressed bytes, or the exception for damaged ones."""
+    try:
+        # read would lose what it has decompressed before the damage
+        return source.read1(_PIECE)
+    except (EOFError, zstd.ZstdError) as error:
+        return error
 
 
 def _no_space(packed: Path, free: int) -> NoSpaceError:

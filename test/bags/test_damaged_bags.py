@@ -240,6 +240,31 @@ def test_remedy_for_a_compressed_file_unpacks_it_first(tmp_path: Path) -> None:
     assert 'reindex' not in truncated
 
 
+def in_blocks(content: bytes) -> bytes:
+    """Compress as zstd does with a large file, in which each block can be decompressed by itself."""
+    packer = zstd.ZstdCompressor()
+    blocks = [packer.compress(content[at : at + 1000], packer.FLUSH_BLOCK) for at in range(0, len(content), 1000)]
+    return b''.join([*blocks, packer.flush()])
+
+
+@pytest.mark.parametrize(('kind', 'damage'), [('mcap', 'cut off'), ('mcap', 'overwritten'), ('sqlite3', 'cut off')])
+def test_intact_part_of_a_compressed_file_is_read(tmp_path: Path, kind: str, damage: str) -> None:
+    # of more than the bytes that are decompressed at once
+    bag = write_sample(tmp_path, kind, count=3000)
+    file, whole = storage_file(bag), sample_messages(3000)
+    packed, half = in_blocks(file.read_bytes()), file.with_name(f'{file.name}.zstd')
+    middle = len(packed) * 9 // 10
+    half.write_bytes(packed[:middle] if damage == 'cut off' else packed[:middle] + b'\xff' * (len(packed) - middle))
+    file.unlink()
+    metadata = bag / 'metadata.yaml'
+    text = metadata.read_text().replace(f'- {file.name}', f'- {half.name}', 1)
+    metadata.write_text(text.replace("compression_mode: ''", 'compression_mode: FILE'))
+    messages, truncated = read(bag)
+    kept = set(messages)
+    assert len(messages) > 3000 and messages == [message for message in whole if message in kept]
+    assert truncated is not None and f'zstd -dc {half}' in truncated
+
+
 def test_missing_topic_is_reported_with_the_damage(tmp_path: Path) -> None:
     bag, first, second = split_in_two(tmp_path)
     first.unlink()
