@@ -1,7 +1,8 @@
 """Checks of Range messages before association: ranges in other units than their limits.
 
 A range in centimetres with a max_range in metres is 'no echo' by REP 117, and one below a min_range in centimetres is
-rejected. Neither is an error, but both give a wrong map. So the values of incoming messages are checked.
+rejected. Neither is an error, but both give a wrong map. So the values of incoming messages are checked: those of all
+sensors together, since most robots have one driver for all, and if there is no suspicion, those of each sensor.
 """
 
 from __future__ import annotations
@@ -12,8 +13,11 @@ from ..common.readings import Floats
 from .message_batch import Ranges
 from .message_types import RangeMessage
 
-SAMPLES = 1024
-"""Most messages that are sampled; they are spread over the whole drive."""
+SAMPLES = 256
+"""Most messages of a sensor that are sampled; they are spread over the whole drive."""
+
+MOST_SENSORS = 256
+"""Most sensors that are sampled, by the name of their frame; it bounds the memory."""
 
 ENOUGH = 30
 """Fewest messages for a check."""
@@ -21,8 +25,9 @@ ENOUGH = 30
 BEYOND = 1.1
 """A range is beyond max_range if it is so many times as large; many drivers send a little more for 'no echo'."""
 
-MANY = 0.15
-"""Fraction of the finite ranges that are beyond max_range, or below min_range, if units differ."""
+MANY, MANY_OF_ONE = 0.15, 0.3
+"""Fractions of the finite ranges that are beyond max_range, or below min_range, if units differ: of all sensors, which
+may be of several kinds, and of one sensor."""
 
 SENTINEL = 0.5
 """If one value has this fraction of the ranges beyond, the driver sends it for 'no echo'."""
@@ -40,30 +45,30 @@ UNITS = {'feet': 3.281, 'inches': 39.37, 'centimetres': 100.0, 'millimetres': 10
 """Units in a metre, in increasing order."""
 
 
-class LimitWatch:
-    """Samples Range messages and warns if ranges and limits seem to be in different units."""
+class _Samples:
+    """Ranges and limits of messages of a sensor, spread over the whole drive."""
 
     def __init__(self) -> None:
-        self.clear()
-
-    def clear(self) -> None:
-        """Remove all samples."""
         # range, min_range and max_range of each
-        self._samples = np.empty((SAMPLES, 3))
+        self._values = np.empty((SAMPLES, 3))
         self._held, self._every, self._count = 0, 1, 0
 
-    def add(self, message: RangeMessage) -> None:
+    @property
+    def values(self) -> Floats:
+        """Ranges, least ranges and largest ranges, shape (N, 3)."""
+        return self._values[: self._held]
+
+    def add(self, range: float, least: float, limit: float) -> None:
         """Count a message, and sample it if it is its turn."""
         self._count += 1
         if self._count % self._every:
             return
-        self._samples[self._held] = message.range, message.min_range, message.max_range
+        self._values[self._held] = range, least, limit
         self._held += 1
         self._halve()
 
-    def add_all(self, messages: Ranges) -> None:
-        """Apply `add` to many messages."""
-        values = np.stack([messages.range, messages.min_range, messages.max_range], axis=1)
+    def add_all(self, values: Floats) -> None:
+        """Apply `add` to each row, shape (N, 3)."""
         done = 0
         while done < len(values):
             # the next sample, and as many as there is space for
@@ -72,7 +77,7 @@ class LimitWatch:
             if not len(taken):
                 break
             step = skip + 1 + (len(taken) - 1) * self._every
-            self._samples[self._held : self._held + len(taken)] = taken
+            self._values[self._held : self._held + len(taken)] = taken
             self._held, self._count, done = self._held + len(taken), self._count + step, done + step
             self._halve()
         self._count += len(values) - done
@@ -81,25 +86,69 @@ class LimitWatch:
         """If the samples are full, drop every second one, and sample half as often from now on."""
         if self._held == SAMPLES:
             self._held //= 2
-            self._samples[: self._held] = self._samples[1::2].copy()
+            self._values[: self._held] = self._values[1::2].copy()
             self._every *= 2
+
+
+class LimitWatch:
+    """Samples Range messages and warns if ranges and limits seem to be in different units."""
+
+    def __init__(self) -> None:
+        self._of: dict[str, _Samples] = {}
+
+    def clear(self) -> None:
+        """Remove all samples."""
+        self._of.clear()
+
+    def add(self, message: RangeMessage) -> None:
+        """Take a message."""
+        samples = self._samples(message.frame_id)
+        if samples is not None:
+            samples.add(message.range, message.min_range, message.max_range)
+
+    def add_all(self, messages: Ranges) -> None:
+        """Apply `add` to many messages."""
+        values = np.stack([messages.range, messages.min_range, messages.max_range], axis=1)
+        order = np.argsort(messages.frame, kind='stable')
+        first = np.searchsorted(messages.frame[order], np.arange(len(messages.frames) + 1))
+        for number, frame in enumerate(messages.frames):
+            part = values[order[first[number] : first[number + 1]]]
+            samples = self._samples(frame) if len(part) else None
+            if samples is not None:
+                samples.add_all(part)
+
+    def _samples(self, frame: str) -> _Samples | None:
+        """Return the samples of a sensor; None if there are too many sensors."""
+        if frame not in self._of and len(self._of) < MOST_SENSORS:
+            self._of[frame] = _Samples()
+        return self._of.get(frame)
 
     def warnings(self) -> list[str]:
         """Return warnings; empty if there is no suspicion."""
-        ranges, _, limits = samples = self._samples[: self._held].T
-        finite = samples[:, np.isfinite(ranges) & (ranges > 0) & (limits > 0) & (limits < np.inf)]
-        if finite.shape[1] < ENOUGH:
+        if not self._of:
             return []
-        # one cause has several symptoms; the first that is reported is enough
-        first = next((text for check in (_beyond, _far, _below) if (text := check(*finite))), '')
-        return [first] if first else []
+        if of_all := _suspicion(np.concatenate([samples.values for samples in self._of.values()]), MANY):
+            return [of_all]
+        found = {frame: _suspicion(samples.values, MANY_OF_ONE) for frame, samples in sorted(self._of.items())}
+        return [f'sensor {frame}: {suspicion}' for frame, suspicion in found.items() if suspicion]
 
 
-def _beyond(ranges: Floats, _: Floats, limits: Floats) -> str:
+def _suspicion(values: Floats, many: float) -> str:
+    """Return what is wrong with ranges and limits, shape (N, 3), in words; '' if there is no suspicion."""
+    ranges, _, limits = samples = values.T
+    finite = samples[:, np.isfinite(ranges) & (ranges > 0) & (limits > 0) & (limits < np.inf)]
+    if finite.shape[1] < ENOUGH:
+        return ''
+    # one cause has several symptoms; the first that is reported is enough
+    return _beyond(finite, many) or _far(finite) or _below(finite, many)
+
+
+def _beyond(samples: Floats, many: float) -> str:
+    ranges, _, limits = samples
     beyond = ranges > BEYOND * limits
     counts = np.unique(ranges[beyond], return_counts=True)[1]
     count = int(counts.sum())
-    if count < MANY * len(ranges) or counts.max() > SENTINEL * count:
+    if count < many * len(ranges) or counts.max() > SENTINEL * count:
         return ''
     # no echo comes from beyond max_range, whatever its unit
     ratio = _at(0.98, (ranges / limits)[beyond])
@@ -111,11 +160,12 @@ def _beyond(ranges: Floats, _: Floats, limits: Floats) -> str:
     )
 
 
-def _below(ranges: Floats, least: Floats, limits: Floats) -> str:
+def _below(samples: Floats, many: float) -> str:
+    ranges, least, limits = samples
     # limits that contradict each other are rejected for that
     below = (ranges < least) & (least < limits)
     count = int(below.sum())
-    if count < MANY * len(ranges):
+    if count < many * len(ranges):
         return ''
     limit = _middle(least)
     # a sonar's blind zone is a few centimetres, and its limits have one unit
@@ -128,7 +178,8 @@ def _below(ranges: Floats, least: Floats, limits: Floats) -> str:
     )
 
 
-def _far(ranges: Floats, _: Floats, limits: Floats) -> str:
+def _far(samples: Floats) -> str:
+    ranges, _, limits = samples
     limit = _middle(limits)
     if limit < FARTHEST:
         return ''

@@ -80,6 +80,12 @@ def scaled(range_by: float, limits_by: float) -> Messages:
     )
 
 
+def of_one(given: Messages, by: float) -> Messages:
+    """A drive in which the driver of one sensor sends ranges in another unit."""
+    frame = sorted(given.extrinsics)[2]
+    return given.with_ranges(lambda m: m._replace(range=m.range * by) if m.frame_id == frame else m)
+
+
 def twice() -> Messages:
     return drive()._replace(ranges=[m for m in drive().ranges for _ in range(2)])
 
@@ -223,6 +229,10 @@ SCENARIOS: dict[str, tuple[Callable[[], Messages], str]] = {
     'ranges in millimetres': (lambda: scaled(1000, 1), r'are the ranges in millimetres and the limits in metres'),
     'ranges in feet': (lambda: scaled(3.281, 1), r'are the ranges in feet and the limits in metres'),
     'ranges in inches': (lambda: scaled(39.37, 1), r'are the ranges in inches and the limits in metres'),
+    'ranges of one sensor in centimetres': (
+        lambda: of_one(circling(), 100),
+        r'^sensor sonar_2: \d+ of \d+ examined ranges .* are the ranges in centimetres and the limits in metres',
+    ),
     'min_range in centimetres': (
         lambda: drive().with_ranges(lambda m: m._replace(min_range=2.0)),
         r'below min_range \(2 m\).*are the limits in centimetres',

@@ -17,7 +17,7 @@ from forward_grid_mapper.core.common.parameters import Parameters
 from forward_grid_mapper.core.common.readings import Readings
 from forward_grid_mapper.core.messages.batch_association import BatchAssociator
 from forward_grid_mapper.core.messages.extrinsics import STEEP, Mount
-from forward_grid_mapper.core.messages.limit_watch import LimitWatch
+from forward_grid_mapper.core.messages.limit_watch import MOST_SENSORS, LimitWatch
 from forward_grid_mapper.core.messages.message_batch import batch_of
 from forward_grid_mapper.core.messages.message_types import NANOSECONDS, OdometryMessage, Pose2, RangeMessage
 from forward_grid_mapper.core.messages.pose_association import PoseAssociator
@@ -208,15 +208,28 @@ def test_measurements_of_a_batch_equal_single_ones(seed: int, angle: float, limi
 @pytest.mark.parametrize('sizes', [[10, 5000, 1, 1, 1023, 7000], [1024, 1024, 1, 9000], [20000]])
 def test_limits_of_a_batch_are_checked_as_for_single_messages(sizes: list[int]) -> None:
     one, many = LimitWatch(), LimitWatch()
-    rng = random.Random(3)
+    rng, names = random.Random(3), ['left', 'right', 'rare']
     for size in sizes:
-        messages = [RangeMessage(0, 's', rng.random(), rng.random(), rng.random(), 0.3) for _ in range(size)]
+        messages = [
+            RangeMessage(0, rng.choice(names), rng.random(), rng.random(), rng.random(), 0.3) for _ in range(size)
+        ]
         for message in messages:
             one.add(message)
         many.add_all(batch_of(list(enumerate(messages))).ranges)
-    assert vars(one).keys() == vars(many).keys()
-    assert (one._held, one._every, one._count) == (many._held, many._every, many._count)
-    np.testing.assert_array_equal(one._samples[: one._held], many._samples[: many._held])
+    assert one._of.keys() == many._of.keys() == set(names)
+    for name in names:
+        first, second = one._of[name], many._of[name]
+        assert (first._every, first._count) == (second._every, second._count)
+        np.testing.assert_array_equal(first.values, second.values)
+
+
+def test_limits_of_too_many_sensors_are_not_watched() -> None:
+    one, many = LimitWatch(), LimitWatch()
+    messages = [RangeMessage(0, f's{k}', 100.0, 0.1, 5.0, 0.3) for k in range(2 * MOST_SENSORS)]
+    for message in messages:
+        one.add(message)
+    many.add_all(batch_of(list(enumerate(messages))).ranges)
+    assert len(one._of) == len(many._of) == MOST_SENSORS
 
 
 def test_batch_yields_its_messages_in_order() -> None:
