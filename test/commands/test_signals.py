@@ -219,7 +219,7 @@ def test_interrupted_simulation_ends_its_child_processes(tmp_path: Path, number:
         # those that make drives, and the resource tracker of multiprocessing
         wait_for(lambda: len(children()) == 3)
         os.killpg(made.pid, number) if number == signal.SIGINT else made.send_signal(number)
-        _, err = made.communicate(timeout=20)
+        _, err = made.communicate(timeout=120)
     finally:
         with suppress(ProcessLookupError):
             os.killpg(made.pid, signal.SIGKILL)

@@ -47,7 +47,7 @@ def written(journal: Journal, readings: Readings) -> None:
     until(lambda: not journal.unwritten)
 
 
-def until(condition: Callable[[], object], seconds: float = 20.0) -> None:
+def until(condition: Callable[[], object], seconds: float = 120.0) -> None:
     end = time.monotonic() + seconds
     while not condition():
         assert time.monotonic() < end

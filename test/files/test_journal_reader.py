@@ -31,7 +31,7 @@ MOST_MB = 150.0
 """Largest memory of a reader for any file; a chunk of readings takes about 20."""
 
 
-def examined(path: Path, seconds: float = 60.0) -> dict[str, Any]:
+def examined(path: Path, seconds: float = 300.0) -> dict[str, Any]:
     """Read a file in another process, which must end in time, without a traceback, and with little memory."""
     done = subprocess.run([*PROGRAM, str(path)], capture_output=True, text=True, timeout=seconds, check=False)
     assert done.returncode == 0, done.stderr

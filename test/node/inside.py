@@ -61,7 +61,7 @@ class Inside:
         assert not self.node.failure
         return self
 
-    def until(self, condition: Callable[[], Any], seconds: float = 200.0) -> Any:
+    def until(self, condition: Callable[[], Any], seconds: float = 500.0) -> Any:
         """Turn the executor until the condition holds; a second counts at most for each turn, if the machine stalls."""
         left, before = seconds, time.monotonic()
         while not (value := condition()):

@@ -36,7 +36,7 @@ MAPS = ('live_map', 'ml_map', 'uncertainty_map')
 KEPT = 1500
 """Most readings in transit; the middleware keeps only 2000 messages of a topic."""
 
-START_TIME = 240.0
+START_TIME = 500.0
 """Seconds; the first start compiles all kernels, on a machine that may be busy."""
 
 
@@ -143,7 +143,7 @@ class Robot:
         while time.monotonic() < end:
             self.executor.spin_once(timeout_sec=0.02)
 
-    def until(self, condition: Callable[[], Any], seconds: float = 200.0, what: str = '') -> Any:
+    def until(self, condition: Callable[[], Any], seconds: float = 500.0, what: str = '') -> Any:
         end = time.monotonic() + seconds
         while not (value := condition()):
             assert time.monotonic() < end, f'it did not happen: {what or condition}'
@@ -178,7 +178,7 @@ class Robot:
                 time.sleep(ahead)
         self.until(lambda: self.received >= self.sent, what=f'{self.sent} readings received')
 
-    def call(self, service: str, kind: Any = Trigger, seconds: float = 200.0, **fields: Any) -> Any:
+    def call(self, service: str, kind: Any = Trigger, seconds: float = 500.0, **fields: Any) -> Any:
         return self.until(self.ask(service, kind, **fields).result, seconds, f'{service} answers')
 
     def ask(self, service: str, kind: Any = Trigger, **fields: Any) -> Any:

@@ -35,7 +35,7 @@ class Caller:
 
     def conclude(self) -> None:
         # the first run compiles kernels, on a machine that may be busy
-        self._conclusions.get(timeout=240.0)()
+        self._conclusions.get(timeout=500.0)()
 
     def outcome_of(self, readings: Readings = READING) -> Outcome:
         found: list[Outcome] = []
@@ -227,7 +227,7 @@ def test_run_that_waits_for_kernels_can_be_cancelled() -> None:
     assert worker.current is not None
     assert 'waiting for the compilation of kernels' in str(worker.current)
     worker.cancel()
-    conclusions.get(timeout=60.0)()
+    conclusions.get(timeout=500.0)()
     assert outcomes[0].message == 'EM was cancelled'
 
 

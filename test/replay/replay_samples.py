@@ -85,7 +85,7 @@ class Replay:
         """Whether it is running."""
         return self._process.poll() is None
 
-    def end(self, seconds: float = 30.0) -> tuple[int, str, str]:
+    def end(self, seconds: float = 120.0) -> tuple[int, str, str]:
         """Wait for the end; return exit code, output and errors."""
         out, err = self._process.communicate(timeout=seconds)
         return self._process.returncode, out, err
@@ -122,7 +122,7 @@ class Listener:
     def _keeper(self, topic: str) -> Callable[[Any], None]:
         return lambda message: self.got.append((topic, message))
 
-    def spin(self, *, until: Callable[[], bool], seconds: float = 20.0) -> None:
+    def spin(self, *, until: Callable[[], bool], seconds: float = 120.0) -> None:
         """Receive messages until the condition holds, which must happen."""
         deadline = time.monotonic() + seconds
         while not until():

@@ -79,7 +79,7 @@ def test_parts_cover_the_range_in_order_and_none_is_small(begin: int, size: int,
 
 
 def test_run_each_runs_work_in_parallel_and_waits() -> None:
-    meeting, done = threading.Barrier(3, timeout=20), []
+    meeting, done = threading.Barrier(3, timeout=120), []
 
     def work(k: int) -> None:
         meeting.wait()
