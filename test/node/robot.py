@@ -153,7 +153,7 @@ class Robot:
     def meet(self) -> None:
         """Wait until the node has subscribed to the topics of the robot."""
         both = (self.range_out, self.odom_out)
-        self.until(lambda: all(p.get_subscription_count() for p in both), 20.0, 'the node subscribes')
+        self.until(lambda: all(p.get_subscription_count() for p in both), what='the node subscribes')
 
     def send(self, message: RangeMessage | OdometryMessage) -> None:
         publisher = self.range_out if isinstance(message, RangeMessage) else self.odom_out
@@ -184,7 +184,7 @@ class Robot:
     def ask(self, service: str, kind: Any = Trigger, **fields: Any) -> Any:
         # each client receives the responses to all clients, and keeps the last 10 by default
         client = self.node.create_client(kind, f'{self.name}/{service}', qos_profile=QoSProfile(depth=100))
-        self.until(client.service_is_ready, 20.0, f'{service} is there')
+        self.until(client.service_is_ready, what=f'{service} is there')
         return client.call_async(kind.Request(**fields))
 
     def get_map(self, name: str) -> OccupancyGrid:
