@@ -16,6 +16,7 @@ import numpy as np
 from ..core.common.errors import BagError, InputError
 from ..core.messages.message_batch import MessageBatch, joined
 from ..core.messages.message_types import OdometryMessage, RangeMessage, range_message
+from ..core.messages.rep117 import proper_name
 from ..core.messages.repeated_topics import RepeatedTopics
 from .choice import ODOMETRY, RANGE, Topics, choose_range_topics, choose_topics
 from .columns import Columns, InOrder
@@ -255,7 +256,9 @@ class Bag:
         parents: dict[str, str] = {}
         for message in self._searched(topics):
             for item in message.transforms:
-                parents[str(item.child_frame_id).lstrip('/')] = str(item.header.frame_id).lstrip('/')
+                child, parent = str(item.child_frame_id).lstrip('/'), str(item.header.frame_id).lstrip('/')
+                if proper_name(child) and proper_name(parent):
+                    parents[child] = parent
         return parents
 
     def constant_transforms_on_tf(self, topics: Topics) -> StaticTransforms:

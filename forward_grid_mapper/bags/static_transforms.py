@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from ..core.common.errors import InputError
 from ..core.messages.extrinsics import Mount, mount_of
 from ..core.messages.quaternions import STEEPEST, rotation_of
+from ..core.messages.rep117 import proper_name
 
 Transform = NDArray[np.float64]  # homogeneous, shape (4, 4)
 
@@ -32,7 +33,7 @@ class StaticTransforms:
     rejected : dict
         Child frames with an invalid transform, and the reason; relevant only if one of them is looked up.
     contradicted : dict
-        Child frames that two topics place differently, and the topic that is used; relevant only if looked up.
+        Child frames that have several poses, and which one is used; relevant only if looked up.
     """
 
     def __init__(self, topic: str = '/tf_static') -> None:
@@ -56,9 +57,13 @@ class StaticTransforms:
         Raises
         ------
         InputError
-            If the quaternion is not normalised, a number is not finite, or a frame is its own parent.
+            If the quaternion is not normalised, a number is not finite, a frame is its own parent, or a name is none.
         """
         parent, child = _plain(parent), _plain(child)
+        if not all(proper_name(name) for name in (parent, child) if name):
+            raise InputError(
+                'A static transform has a frame whose name is too long or cannot be printed; fix its publisher.'
+            )
         what = f'The static transform from {parent!r} to {child!r}'
         x, y, z, w = (float(v) for v in quaternion_xyzw)
         rotation = rotation_of(x, y, z, w)
@@ -72,6 +77,12 @@ class StaticTransforms:
         transform = np.eye(4)
         transform[:3, :3] = rotation
         transform[:3, 3] = translation_xyz
+        known = self._parents.get(child)
+        if known is not None and not _same(known, (parent, transform)):
+            self.contradicted[child] = (
+                f'{self._topic} contains different poses of {child!r}; the last one is used for the whole drive. If '
+                'the sensor was moved, map only a part with --start and --duration, and set --sensor'
+            )
         self._parents[child] = parent, transform
         self.rejected.pop(child, None)
 
@@ -80,7 +91,7 @@ class StaticTransforms:
         self.contradicted |= other.contradicted
         for child, (parent, transform) in other._parents.items():
             known, topic = self._parents.get(child), other._topics.get(child, other._topic)
-            if known is not None and not (known[0] == parent and np.allclose(known[1], transform, atol=SAME)):
+            if known is not None and not _same(known, (parent, transform)):
                 self.contradicted[child] = (
                     f'{self._topics.get(child, self._topic)} and {topic} contain different poses of {child!r}; that of '
                     f'{topic} is used. If it belongs to another robot, set --sensor'
@@ -147,6 +158,11 @@ class StaticTransforms:
             transform = step @ transform
             found[frame] = transform
         return found
+
+
+def _same(one: tuple[str, Transform], other: tuple[str, Transform]) -> bool:
+    """Return whether two transforms of a frame, each with its parent, are equal."""
+    return one[0] == other[0] and np.allclose(one[1], other[1], atol=SAME)
 
 
 def _plain(frame: str) -> str:

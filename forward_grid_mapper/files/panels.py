@@ -46,12 +46,12 @@ class Curve(NamedTuple):
 def coarse(values: NDArray[Any], step: int) -> NDArray[np.float32]:
     """Return a map in blocks of `step` cells, each with the largest of its values; NaN if all are NaN.
 
-    So walls one cell thick are not lost between the pixels of a picture. Rows and columns are padded with NaN.
+    So walls one cell thick are not lost between the pixels of a picture. The last row and column of blocks may be
+    smaller: padded to whole blocks, a map would need memory for `step`², and the step is huge if a path jumps far away.
     """
-    pad = [(0, -n % step) for n in values.shape]
-    part = np.pad(np.asarray(values, np.float32), pad, constant_values=np.nan)
-    part = np.fmax.reduce(part.reshape(part.shape[0] // step, step, -1), axis=1)
-    return np.asarray(np.fmax.reduce(part.reshape(part.shape[0], -1, step), axis=2))
+    rows, columns = (np.arange(0, n, step) for n in values.shape)
+    part = np.fmax.reduceat(np.asarray(values, np.float32), rows, axis=0)
+    return np.asarray(np.fmax.reduceat(part, columns, axis=1))
 
 
 class Panel(NamedTuple):

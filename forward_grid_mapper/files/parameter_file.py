@@ -51,8 +51,8 @@ def load_parameters(path: Path | str) -> ParameterFile:
     """Read a ROS 2 parameter YAML, or a flat mapping of names to values.
 
     Names may be nested or dotted. In a ROS file the sections `/**` and `forward_grid_mapper` (in one namespace) are
-    used, and the latter takes precedence; a section of another name is used, with a warning in the log, if it is the
-    only one, as for a renamed node, unless its name looks misspelt.
+    used, and the later one takes precedence, as in the node; a section of another name is used, with a warning in the
+    log, if it is the only one, as for a renamed node, unless its name looks misspelt.
 
     Raises
     ------
@@ -168,14 +168,15 @@ def _sections(document: Any) -> list[dict[str, Any]]:
             f'{", ".join(stray[:6])}: a node reads only the values below ros__parameters; put them into one of the '
             f'sections {", ".join(found)}'
         )
-    wildcards = [s for name, s in found.items() if name.strip('/') in ('*', '**')]
+    wildcards = [name for name in found if name.strip('/') in ('*', '**')]
     own = [name for name in found if name.rpartition('/')[2] == NODE_NAME]
     if len(own) > 1:
         raise ParameterError(
             f'it has {NODE_NAME} in several namespaces ({", ".join(own)}); give a file with the section of only one '
             'of them'
         )
-    if chosen := wildcards + [found[name] for name in own]:
+    # in the order of the file: rcl sets the values of all sections that match, one after the other
+    if chosen := [section for name, section in found.items() if name in wildcards + own]:
         return chosen
     if len(found) > 1:
         raise ParameterError(f'it has no section for {NODE_NAME} or /**; there are: {", ".join(found)}')

@@ -11,7 +11,7 @@ from ..core.common.words import counted
 from ..core.messages.message_account import MOST_FRAMES
 from ..core.messages.message_types import NANOSECONDS
 from ..core.messages.pose_association import PoseAssociator
-from ..core.messages.rep117 import LONGEST_NAME
+from ..core.messages.rep117 import proper_name
 
 LASTING = 10.0
 """Seconds for which a jump counts, and between two warnings in the log."""
@@ -110,8 +110,7 @@ class SensorClocks:
             return
         lag, window = odometry - stamp, self._windows.get(frame)
         if window is None or odometry < window.begin:
-            proper = 0 < len(frame) <= LONGEST_NAME and frame.isprintable()
-            if window is not None or (len(self._windows) < MOST_FRAMES and proper):
+            if window is not None or (len(self._windows) < MOST_FRAMES and proper_name(frame)):
                 self._windows[frame] = _Window(odometry, odometry, lag, lag)
             return
         window.last, window.count = odometry, window.count + 1

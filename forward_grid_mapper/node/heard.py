@@ -6,7 +6,7 @@ import time
 from collections.abc import Iterator
 
 from ..core.messages.message_account import MOST_FRAMES
-from ..core.messages.rep117 import LONGEST_NAME
+from ..core.messages.rep117 import proper_name
 
 TIME_OUT = 3.0
 """Shortest time without a message, seconds, after which a sensor is silent."""
@@ -60,7 +60,7 @@ class Heard:
             elif gap < _patience(interval):
                 interval += 0.1 * (gap - interval)
             self._sensors[frame] = now, interval
-        elif len(self._sensors) < MOST_FRAMES and frame.isprintable() and 0 < len(frame) <= LONGEST_NAME:
+        elif len(self._sensors) < MOST_FRAMES and proper_name(frame):
             self._sensors[frame] = now, 0.0
 
     @property

@@ -137,3 +137,25 @@ def test_composition_agrees_with_rotating_vectors() -> None:
 def test_message_states_the_length_of_a_bad_quaternion(quaternion: tuple[float, ...], length: str) -> None:
     with pytest.raises(InputError, match=f'a quaternion of length {length} instead of 1'):
         StaticTransforms().add('base', 'sonar', (0.0, 0.0, 0.0), quaternion)
+
+
+@pytest.mark.parametrize('name', ['\x1b[31mred', 'a\nb', '\u202e', 'n' * 256])
+def test_name_that_no_frame_has_is_rejected_and_not_shown(name: str) -> None:
+    """It would change the colours of the terminal, or fill it."""
+    for parent, child in ((name, 'sonar'), ('base', name)):
+        transforms = StaticTransforms()
+        with pytest.raises(InputError, match='too long or cannot be printed') as caught:
+            transforms.add(parent, child, NONE, IDENTITY)
+        assert name not in str(caught.value) and not transforms.frames
+
+
+def test_different_poses_on_one_topic_are_a_doubt() -> None:
+    transforms = StaticTransforms()
+    transforms.add('base', 'left', NONE, IDENTITY)
+    transforms.add('base', 'left', NONE, IDENTITY)
+    transforms.add('base', 'right', NONE, IDENTITY)
+    transforms.add('base', 'right', (1.0, 0.0, 0.0), IDENTITY)
+    assert transforms.lookup('base', 'right') == Pose2(1.0, 0.0, 0.0)
+    assert not transforms.doubts('base', 'left')
+    (doubt,) = transforms.doubts('base', 'right')
+    assert "different poses of 'right'" in doubt and 'the last one is used' in doubt

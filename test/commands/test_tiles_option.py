@@ -30,6 +30,12 @@ def test_maps_in_tiles_have_the_same_output_files(tmp_path: Path) -> None:
     assert '\nTiles' not in (tmp_path / 'whole' / 'report.txt').read_text('utf-8')
 
 
+@pytest.mark.parametrize('size', [1e20, 1e308])
+def test_tile_larger_than_all_maps_is_the_whole_map(tmp_path: Path, size: float) -> None:
+    bag = write_tape(tmp_path / 'bag', tape())
+    assert mapped(bag, tmp_path / 'maps', '--tiles', size)['statistics']['tiles'] == 1
+
+
 @pytest.mark.parametrize('size', ['0', '-5', 'nan', 'inf'])
 def test_impossible_size_of_tiles_is_rejected(tmp_path: Path, size: str, capsys: pytest.CaptureFixture[str]) -> None:
     bag = write_tape(tmp_path / 'bag', tape())

@@ -111,17 +111,18 @@ def test_file_without_values_is_read(tmp_path: Path, text: str) -> None:
     assert load(tmp_path, text) == ParameterFile({}, {}, {})
 
 
-def test_section_of_the_node_overrides_that_of_all_nodes(tmp_path: Path) -> None:
+def test_later_one_of_the_sections_of_the_node_and_of_all_nodes_overrides(tmp_path: Path) -> None:
+    """As in the node, which `test_ros_parameters.py` compares."""
     own = 'forward_grid_mapper: {ros__parameters: {p_hit: 0.5}}\n'
     common = '/**: {ros__parameters: {p_hit: 0.3, use_sim_time: true}}\n'
-    for text in (own + common, common + own):
-        assert load(tmp_path, text) == ParameterFile({'p_hit': 0.5}, {}, {'use_sim_time': True})
+    for text, p_hit in ((own + common, 0.3), (common + own, 0.5)):
+        assert load(tmp_path, text) == ParameterFile({'p_hit': p_hit}, {}, {'use_sim_time': True})
 
 
-def test_section_of_the_node_wins_for_a_frame_with_a_slash(tmp_path: Path) -> None:
+def test_later_section_wins_for_a_frame_with_a_slash(tmp_path: Path) -> None:
     own = 'forward_grid_mapper: {ros__parameters: {sensors./a.pose: [0.5, 0.0, 0.0]}}\n'
     common = '/**: {ros__parameters: {sensors.a.pose: [0.1, 0.0, 0.0], sensors.b.pose: [0.2, 0.0, 0.0]}}\n'
-    assert load(tmp_path, own + common).extrinsics == {'/a': (0.5, 0.0, 0.0), 'b': (0.2, 0.0, 0.0)}
+    assert load(tmp_path, common + own).extrinsics == {'/a': (0.5, 0.0, 0.0), 'b': (0.2, 0.0, 0.0)}
 
 
 def test_section_of_all_nodes_applies_in_a_namespace(tmp_path: Path) -> None:

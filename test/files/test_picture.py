@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import sys
+import tracemalloc
 import warnings
 from pathlib import Path
 
@@ -124,6 +125,16 @@ def test_coarse_blocks_keep_the_largest_value(shape: tuple[int, int], step: int)
         block = values[row * step : (row + 1) * step, column * step : (column + 1) * step]
         known = block[~np.isnan(block)]
         assert np.isnan(found[row, column]) if not len(known) else found[row, column] == np.float32(known.max())
+
+
+def test_a_path_far_away_needs_no_memory_for_the_picture(tmp_path: Path) -> None:
+    """Odometry jumps by 10 000 km: the map is much smaller than a pixel."""
+    tracemalloc.start()
+    try:
+        write_picture(tmp_path / 'maps.png', made_maps(), np.array([(0.0, 0.0), (1e7, 0.0)]), 'jump')
+        assert tracemalloc.get_traced_memory()[1] < 100e6
+    finally:
+        tracemalloc.stop()
 
 
 def test_unexplained_readings_end_on_their_axis() -> None:

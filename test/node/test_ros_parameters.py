@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import array
 import math
+from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
@@ -11,11 +12,14 @@ import pytest
 
 pytest.importorskip('rclpy', reason='parameters are those of rclpy')
 
+import rclpy
+from rclpy.context import Context
 from rclpy.parameter import Parameter as RosParameter
 
 from forward_grid_mapper.core.common.errors import ParameterError
 from forward_grid_mapper.core.common.parameters import TABLE, Parameters
 from forward_grid_mapper.core.messages.message_types import Pose2
+from forward_grid_mapper.files.parameter_file import load_parameters
 from forward_grid_mapper.node.ros_parameters import declare, descriptor, validator, with_points
 
 ROWS = {row.name: row for row in TABLE}
@@ -183,3 +187,20 @@ def test_whole_number_is_converted_to_a_double_parameter() -> None:
     ]
     assert [change.name for change in found] == [change.name for change in changes]
     assert found[0].value == 1.0 and isinstance(found[0].value, float)
+
+
+@pytest.mark.parametrize('order', [1, -1])
+def test_file_has_the_same_values_for_the_node_and_the_offline_tool(tmp_path: Path, domain: int, order: int) -> None:
+    sections = ['/**: {ros__parameters: {p_hit: 0.3}}\n', 'forward_grid_mapper: {ros__parameters: {p_hit: 0.5}}\n']
+    file = tmp_path / 'parameters.yaml'
+    file.write_text(''.join(sections[::order]))
+    context = Context()
+    rclpy.init(args=['test', '--ros-args', '--params-file', str(file)], context=context, domain_id=domain)
+    try:
+        node = rclpy.create_node(
+            'forward_grid_mapper', context=context, automatically_declare_parameters_from_overrides=True
+        )
+        assert load_parameters(file).values['p_hit'] == node.get_parameter('p_hit').value
+        node.destroy_node()
+    finally:
+        rclpy.shutdown(context=context)

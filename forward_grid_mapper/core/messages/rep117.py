@@ -303,6 +303,11 @@ def measure_all(messages: Ranges, parameters: AssociationParameters) -> Measurem
     return Measurements(reason, np.where(over, z_max, z), z_max, angle / 2, sigma)
 
 
+def proper_name(frame_id: str) -> bool:
+    """Return whether a frame can have this name: one that cannot be printed would change the colours of a terminal."""
+    return not _of_name(frame_id)
+
+
 def _of_name(frame_id: str) -> str:
     """Return why messages of a frame are rejected; '' if they are not."""
     if not frame_id:

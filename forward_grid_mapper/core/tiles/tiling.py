@@ -29,6 +29,9 @@ wall. The prior depends on `NEIGHBOURS_AWAY` more cells."""
 
 NEIGHBOURS_AWAY = 3
 
+LARGEST_EDGE = 1 << 40
+"""Cells; no map is as large."""
+
 
 class Tile(NamedTuple):
     """One tile: its row and column among the tiles, its core and its window."""
@@ -141,8 +144,8 @@ class Tiling:
 
 
 def edge_of(size: float, resolution: float) -> int:
-    """Return the side of tiles of `size` metres, cells."""
-    return max(round(size / resolution), 1)
+    """Return the side of tiles of `size` metres, cells: at most `LARGEST_EDGE`, so that integers do not overflow."""
+    return max(round(min(size / resolution, LARGEST_EDGE)), 1)
 
 
 def _touched(
