@@ -123,6 +123,9 @@ def start(context):
     namespace = LaunchConfiguration('namespace')
     clock = [{'use_sim_time': is_on(given['use_sim_time'])}] if given['use_sim_time'] else []
     chosen = {name: parameter_value(name, given[name]) for name in PARAMETERS if given[name]}
+    # RViz shows a map in another frame only if it knows the transform at the map's stamp, which one that starts later
+    # does not
+    frame = given['map_frame'] or ('map' if is_on(given['refine_poses']) else '')
     mapper = Node(
         package=PACKAGE,
         executable='mapper',
@@ -159,7 +162,7 @@ def start(context):
             (f'/{PACKAGE}/path', f'{PACKAGE}/path'),
             ('/odom', LaunchConfiguration('odom')),
         ],
-        arguments=['-d', LaunchConfiguration('rviz_config')],
+        arguments=['-d', LaunchConfiguration('rviz_config'), *(['-f', frame] if frame else [])],
     )
     # RViz first: where it is not installed, launch ends before it has started a mapper that nothing would stop
     return [*([LogInfo(msg=OF_PROBABILITIES)] if given['map'] not in ('', 'ml_map') else []), rviz, mapper]

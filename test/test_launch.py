@@ -144,8 +144,8 @@ def test_topics_of_rviz_follow_the_namespace(description: list[Call]) -> None:
     assert node['namespace'] == rviz['namespace'] == 'robot'
     for moved in (node, rviz):
         assert {('/tf', 'tf'), ('/tf_static', 'tf_static')} <= set(moved['remappings'])
-    folder, config = rviz['arguments']
-    assert folder == '-d'
+    option, config = rviz['arguments']
+    assert option == '-d'
     renamed = dict(rviz['remappings'])
     displays = yaml.safe_load((ROOT / config.removeprefix('share/forward_grid_mapper/')).read_text())
     for display in displays['Visualization Manager']['Displays']:
@@ -208,6 +208,23 @@ def test_switches_accept_the_spelling_of_python(description: list[Call], written
     assert nodes['mapper']['parameters'][1:] == [{'use_sim_time': True}, {'online': True}]
     assert nodes['rviz2']['parameters'] == [{'use_sim_time': True}]
     assert nodes['mapper']['respawn'] is True
+
+
+@pytest.mark.parametrize(
+    ('given', 'expected'),
+    [
+        ({}, []),
+        ({'refine_poses': 'false'}, []),
+        ({'refine_poses': 'True'}, ['-f', 'map']),
+        ({'map_frame': 'site'}, ['-f', 'site']),
+        ({'map_frame': 'site', 'refine_poses': 'true'}, ['-f', 'site']),
+    ],
+)
+def test_fixed_frame_of_rviz_is_that_of_the_maps(
+    description: list[Call], given: dict[str, str], expected: list[str]
+) -> None:
+    """RViz filters maps by the transform to its fixed frame at their stamps, unless they are in that frame."""
+    assert launched(description, rviz='true', **given)['rviz2']['arguments'][2:] == expected
 
 
 def test_mapper_is_respawned_on_request(description: list[Call]) -> None:
