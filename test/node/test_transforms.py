@@ -22,7 +22,7 @@ from rclpy.lifecycle.node import TransitionCallbackReturn
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import MultiDOFJointState
 
-from forward_grid_mapper.node import frames, surroundings
+from forward_grid_mapper.node import frames, intake, surroundings
 
 VOLATILE = QoSProfile(depth=10, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.VOLATILE)
 WARN = b'\x01'
@@ -36,6 +36,7 @@ class Buffer:
     """Stand-in for `tf2_ros.Buffer`; each transform is the pose of the sensor on the robot."""
 
     def __init__(self, cache_time: Any = None, node: Any = None) -> None:
+        self.cache_time = cache_time
         self.listener: Any = None
         self.transform: Any = None
 
@@ -54,11 +55,13 @@ class Buffer:
 class Listener:
     """Stand-in for `tf2_ros.TransformListener`: its subscriptions end with it, in a group of their own."""
 
-    def __init__(self, buffer: Any, node: Any, *, spin_thread: bool = False) -> None:
+    def __init__(
+        self, buffer: Any, node: Any, *, spin_thread: bool = False, qos: Any = None, static_qos: Any = None
+    ) -> None:
         assert not spin_thread
         self.buffer, self.node, self.group = buffer, node, ReentrantCallbackGroup()
-        volatile = QoSProfile(depth=100, durability=DurabilityPolicy.VOLATILE)
-        latched = QoSProfile(depth=100, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+        volatile = qos or QoSProfile(depth=100, durability=DurabilityPolicy.VOLATILE)
+        latched = static_qos or QoSProfile(depth=100, durability=DurabilityPolicy.TRANSIENT_LOCAL)
         self.tf_sub, self.tf_static_sub = (
             node.create_subscription(
                 MultiDOFJointState, topic, lambda message: None, quality, callback_group=self.group
@@ -149,6 +152,16 @@ def test_clean_up_ends_the_listener_and_configure_makes_another(inside: Callable
         gc.collect()
         assert listener() is None and of_transforms() == []
         robot.start()
+
+
+def test_transforms_wait_for_the_node_as_long_as_readings_do(inside: Callable[..., Inside]) -> None:
+    robot = inside()
+    robot.node.start()
+    buffer: Any = robot.node._extrinsics._transforms._buffer
+    assert buffer.cache_time.nanoseconds == frames.KEPT * 10**9
+    of_tf = buffer.listener.tf_sub.qos_profile
+    assert (of_tf.depth, of_tf.durability) == (intake.QUEUE, DurabilityPolicy.VOLATILE)
+    assert of_tf.reliability == ReliabilityPolicy.RELIABLE
 
 
 def test_static_transforms_published_too_early_are_reported(
