@@ -131,7 +131,7 @@ def start(context):
     chosen = {name: parameter_value(name, given[name]) for name in PARAMETERS if given[name]}
     # RViz shows a map in another frame only if it knows the transform at the map's stamp, which one that starts later
     # does not
-    frame = given['map_frame'] or ('map' if is_on(given['refine_poses']) else '')
+    frame = given['map_frame'].lstrip('/') or ('map' if is_on(given['refine_poses']) else '')
     mapper = Node(
         package=PACKAGE,
         executable='mapper',

@@ -233,6 +233,8 @@ def test_switches_accept_the_spelling_of_python(description: list[Call], written
         ({'refine_poses': 'false'}, []),
         ({'refine_poses': 'True'}, ['-f', 'map']),
         ({'map_frame': 'site'}, ['-f', 'site']),
+        # the node strips the slash of ROS 1 as well
+        ({'map_frame': '/site'}, ['-f', 'site']),
         ({'map_frame': 'site', 'refine_poses': 'true'}, ['-f', 'site']),
     ],
 )

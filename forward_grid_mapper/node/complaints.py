@@ -134,7 +134,7 @@ def of_sections(arguments: Sequence[str], node: str) -> list[str]:
             more = f' and {len(names) - 3} more' if len(names) > 3 else ''
             found.append(
                 f'--params-file {file} is ignored: it has parameters of {", ".join(names[:3])}{more}, but this node is '
-                f'{node}; rename the section to /** or {node}'
+                f'{node}; what is meant for this node belongs into a section /** or {node}'
             )
     return found
 

@@ -171,7 +171,7 @@ def test_parameter_file_of_another_node_gives_a_warning(tmp_path: Path, text: st
     file.write_text(text)
     found = complaints.of_sections(['--ros-args', '--params-file', str(file)], '/robot1/forward_grid_mapper')
     assert len(found) == bool(names)
-    assert all(names in line and 'rename the section to /** or /robot1/forward_grid_mapper' in line for line in found)
+    assert all(names in line and 'into a section /** or /robot1/forward_grid_mapper' in line for line in found)
     assert complaints.of_sections(['--params-file', '/nowhere.yaml', '--params-file'], '/a') == []
 
 
