@@ -1,5 +1,7 @@
 """Starts the mapper and, on request, RViz with its three maps."""
 
+from pathlib import Path
+
 from launch import LaunchDescription
 from launch.actions import DeclareLaunchArgument, LogInfo, OpaqueFunction
 from launch.conditions import IfCondition
@@ -120,9 +122,16 @@ def start(context):
     given = {
         name: LaunchConfiguration(name).perform(context) for name in (*PARAMETERS, 'map', 'use_sim_time', 'use_respawn')
     }
+    # shells leave ~ in name:=~/file; and launch would only warn, and start a mapper without the poses of its sensors
+    params_file = Path(LaunchConfiguration('params_file').perform(context)).expanduser()
+    if not params_file.is_file():
+        raise RuntimeError(f'params_file: there is no file {params_file}')
     namespace = LaunchConfiguration('namespace')
     clock = [{'use_sim_time': is_on(given['use_sim_time'])}] if given['use_sim_time'] else []
     chosen = {name: parameter_value(name, given[name]) for name in PARAMETERS if given[name]}
+    # RViz shows a map in another frame only if it knows the transform at the map's stamp, which one that starts later
+    # does not
+    frame = given['map_frame'].lstrip('/') or ('map' if is_on(given['refine_poses']) else '')
     mapper = Node(
         package=PACKAGE,
         executable='mapper',
@@ -132,7 +141,7 @@ def start(context):
         emulate_tty=True,
         respawn=is_on(given['use_respawn']),
         respawn_delay=2.0,
-        parameters=[LaunchConfiguration('params_file'), *clock, *([chosen] if chosen else [])],
+        parameters=[str(params_file), *clock, *([chosen] if chosen else [])],
         remappings=[
             *TRANSFORMS,
             ('sonar', LaunchConfiguration('sonar')),
@@ -159,7 +168,7 @@ def start(context):
             (f'/{PACKAGE}/path', f'{PACKAGE}/path'),
             ('/odom', LaunchConfiguration('odom')),
         ],
-        arguments=['-d', LaunchConfiguration('rviz_config')],
+        arguments=['-d', LaunchConfiguration('rviz_config'), *(['-f', frame] if frame else [])],
     )
     # RViz first: where it is not installed, launch ends before it has started a mapper that nothing would stop
     return [*([LogInfo(msg=OF_PROBABILITIES)] if given['map'] not in ('', 'ml_map') else []), rviz, mapper]

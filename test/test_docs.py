@@ -65,6 +65,7 @@ ALLOWED = {
     'plugins': 'a setting of Nav2',
     'subscribe_to_updates: true': 'a setting of Nav2',
     'SetParameter': 'an action of launch files',
+    'PushROSNamespace': 'an action of launch files',
     'ros2 topic info -v': 'a command of ROS 2',
     'ros2 bag play': 'a command of ROS 2',
     'raw': 'a mode of map_server',

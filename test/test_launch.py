@@ -51,7 +51,8 @@ class Call:
         if self.kind == 'PathJoinSubstitution':
             return '/'.join(str(resolved(part, values)) for part in self.arguments[0])
         if self.kind == 'FindPackageShare':
-            return f'share/{self.arguments[0]}'
+            assert self.arguments == ('forward_grid_mapper',)
+            return str(ROOT)
         if self.kind == 'ParameterValue':
             text = resolved(self.arguments[0], values)
             assert self.options['value_type'] is str
@@ -110,7 +111,7 @@ def test_default_launch_starts_only_the_node(description: list[Call]) -> None:
     assert (node['package'], node['name'], node['namespace']) == ('forward_grid_mapper', 'forward_grid_mapper', '')
     # no parameters that would override the file or SetParameter
     (file,) = node['parameters']
-    assert load_parameters(ROOT / file.removeprefix('share/forward_grid_mapper/')).values
+    assert load_parameters(file).values
     assert node['arguments'] == ['--ros-args', '--log-level', 'info']
     assert node['respawn'] is False
 
@@ -123,19 +124,33 @@ def test_all_arguments_have_a_description(description: list[Call]) -> None:
     assert all(call.options['description'] for call in arguments)
 
 
-def test_arguments_are_passed_to_the_node(description: list[Call]) -> None:
+def test_arguments_are_passed_to_the_node(description: list[Call], tmp_path: Path) -> None:
+    file = tmp_path / 'my.yaml'
+    file.touch()
     given = {
-        'params_file': '/my.yaml',
+        'params_file': str(file),
         'use_sim_time': 'true',
         'sonar': '/range',
         'odom': 'wheels',
         'log_level': 'debug',
     }
     node = launched(description, **given)['mapper']
-    assert node['parameters'] == ['/my.yaml', {'use_sim_time': True}]
+    assert node['parameters'] == [str(file), {'use_sim_time': True}]
     assert dict(node['remappings'])['sonar'] == '/range'
     assert dict(node['remappings'])['odom'] == 'wheels'
     assert node['arguments'][-1] == 'debug'
+
+
+def test_parameter_file_in_the_home_folder_is_found_and_a_missing_one_ends_launch(
+    description: list[Call], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A shell passes `params_file:=~/my.yaml` unchanged, and launch only warns of a file that does not exist."""
+    monkeypatch.setenv('HOME', str(tmp_path))
+    file = tmp_path / 'my.yaml'
+    with pytest.raises(RuntimeError, match=f'params_file: there is no file {file}'):
+        launched(description, params_file='~/my.yaml')
+    file.touch()
+    assert launched(description, params_file='~/my.yaml')['mapper']['parameters'] == [str(file)]
 
 
 def test_topics_of_rviz_follow_the_namespace(description: list[Call]) -> None:
@@ -144,10 +159,10 @@ def test_topics_of_rviz_follow_the_namespace(description: list[Call]) -> None:
     assert node['namespace'] == rviz['namespace'] == 'robot'
     for moved in (node, rviz):
         assert {('/tf', 'tf'), ('/tf_static', 'tf_static')} <= set(moved['remappings'])
-    folder, config = rviz['arguments']
-    assert folder == '-d'
+    option, config = rviz['arguments']
+    assert option == '-d'
     renamed = dict(rviz['remappings'])
-    displays = yaml.safe_load((ROOT / config.removeprefix('share/forward_grid_mapper/')).read_text())
+    displays = yaml.safe_load(Path(config).read_text())
     for display in displays['Visualization Manager']['Displays']:
         for kind in ('Topic', 'Update Topic'):
             if topic := display.get(kind, {}).get('Value'):
@@ -195,7 +210,8 @@ def test_chosen_map_is_remapped_for_nav2(description: list[Call]) -> None:
 
 @pytest.mark.parametrize('chosen', ['', 'ml_map', 'live_map', 'uncertainty_map'])
 def test_map_of_probabilities_logs_the_settings_for_nav2(description: list[Call], chosen: str) -> None:
-    values = {call.arguments[0]: '' for call in description if call.kind == 'DeclareLaunchArgument'} | {'map': chosen}
+    values = {call.arguments[0]: '' for call in description if call.kind == 'DeclareLaunchArgument'}
+    values |= {'map': chosen, 'params_file': str(ROOT / 'config' / 'mapper.yaml')}
     (opaque,) = (call for call in description if call.kind == 'OpaqueFunction')
     messages = [call.options['msg'] for call in opaque.options['function'](values) if call.kind == 'LogInfo']
     assert len(messages) == (chosen in ('live_map', 'uncertainty_map'))
@@ -208,6 +224,25 @@ def test_switches_accept_the_spelling_of_python(description: list[Call], written
     assert nodes['mapper']['parameters'][1:] == [{'use_sim_time': True}, {'online': True}]
     assert nodes['rviz2']['parameters'] == [{'use_sim_time': True}]
     assert nodes['mapper']['respawn'] is True
+
+
+@pytest.mark.parametrize(
+    ('given', 'expected'),
+    [
+        ({}, []),
+        ({'refine_poses': 'false'}, []),
+        ({'refine_poses': 'True'}, ['-f', 'map']),
+        ({'map_frame': 'site'}, ['-f', 'site']),
+        # the node strips the slash of ROS 1 as well
+        ({'map_frame': '/site'}, ['-f', 'site']),
+        ({'map_frame': 'site', 'refine_poses': 'true'}, ['-f', 'site']),
+    ],
+)
+def test_fixed_frame_of_rviz_is_that_of_the_maps(
+    description: list[Call], given: dict[str, str], expected: list[str]
+) -> None:
+    """RViz filters maps by the transform to its fixed frame at their stamps, unless they are in that frame."""
+    assert launched(description, rviz='true', **given)['rviz2']['arguments'][2:] == expected
 
 
 def test_mapper_is_respawned_on_request(description: list[Call]) -> None:

@@ -86,6 +86,12 @@ def test_manifest_has_the_entries_of_colcon_and_rosdep(manifest: ElementTree.Ele
         assert sorted(found) == sorted(names)
 
 
+def test_manifest_bounds_no_version_that_debian_counts_otherwise(manifest: ElementTree.Element) -> None:
+    """A Debian package has these bounds; python3-numpy is 1:1.26.4 there, and so above any bound without an epoch."""
+    (numpy,) = (element for element in manifest.findall('exec_depend') if element.text == 'python3-numpy')
+    assert set(numpy.attrib) == {'version_gte'}
+
+
 def test_manifest_names_a_maintainer(manifest: ElementTree.Element, setup: dict[str, Any]) -> None:
     maintainer = manifest.find('maintainer')
     assert maintainer is not None

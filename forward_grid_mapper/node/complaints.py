@@ -4,8 +4,12 @@ from __future__ import annotations
 
 import difflib
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from itertools import pairwise
 from pathlib import Path
+from typing import Any
+
+import yaml
 
 from ..core.common.errors import MapperError
 from ..core.common.parameters import TABLE
@@ -103,3 +107,47 @@ def of_ros(error: BaseException) -> str:
     if 'PARAMETER_NOT_SET' in text:
         return 'a parameter has no value, or an empty list (range_topics:=[]): set a value, or leave it out'
     return text or repr(error)
+
+
+def of_sections(arguments: Sequence[str], node: str) -> list[str]:
+    """Return warnings about parameter files without a section for a node; ROS ignores such a file silently.
+
+    Parameters
+    ----------
+    arguments : sequence of str
+        The command line.
+    node : str
+        The full name of the node.
+    """
+    found = []
+    for option, file in pairwise(arguments):
+        # a pipe cannot be read a second time
+        if option != '--params-file' or not Path(file).is_file():
+            continue
+        try:
+            # composed, not loaded, since launch writes tags of Python, which ROS ignores
+            names = list(dict.fromkeys(_sections(yaml.compose(Path(file).read_text(encoding='utf-8')), '')))
+        except (OSError, ValueError, RecursionError, yaml.YAMLError):
+            # ROS has accepted it
+            continue
+        if names and not any(re.fullmatch(_pattern(name), node) for name in names):
+            more = f' and {len(names) - 3} more' if len(names) > 3 else ''
+            found.append(
+                f'--params-file {file} is ignored: it has parameters of {", ".join(names[:3])}{more}, but this node is '
+                f'{node}; what is meant for this node belongs into a section /** or {node}'
+            )
+    return found
+
+
+def _pattern(section: str) -> str:
+    """Return the pattern of the nodes to which rclpy gives the parameters of a section."""
+    return re.escape(section).replace(r'/\*', r'(/\w+)').replace(r'\*', '*')
+
+
+def _sections(document: Any, prefix: str) -> Iterator[str]:
+    """Yield the full names of the sections of a composed parameter file."""
+    for key, value in document.value if isinstance(document, yaml.MappingNode) else ():
+        if key.value == 'ros__parameters':
+            yield prefix
+        elif isinstance(key.value, str):
+            yield from _sections(value, f'{prefix}/{key.value.strip("/")}')

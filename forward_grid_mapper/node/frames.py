@@ -19,6 +19,14 @@ PATIENCE = 0.2
 """Seconds before a frame that TF did not know is looked up again, so that a missing frame costs little."""
 
 
+QUEUE = 2000
+"""Most messages of TF that may wait for the node in the middleware, as for readings; tf2's own listener has 100, and
+interpolates over those that were dropped."""
+
+KEPT = 30
+"""Seconds of transforms that are kept, by stamps; with tf2's 10 s, those of a bag that is played ten times as fast are
+gone after a pause of a second."""
+
 MOST_HELD = 10_000
 """Most odometry messages that wait for a transform."""
 
@@ -62,9 +70,12 @@ class Transforms:
             import tf2_ros
         except ImportError:
             return cls()
-        buffer = tf2_ros.Buffer()
+        from rclpy.duration import Duration
+        from rclpy.qos import QoSProfile
+
+        buffer = tf2_ros.Buffer(Duration(seconds=KEPT))
         # so that the listener lives as long as the buffer
-        buffer.listener = tf2_ros.TransformListener(buffer, node, spin_thread=False)
+        buffer.listener = tf2_ros.TransformListener(buffer, node, spin_thread=False, qos=QoSProfile(depth=QUEUE))
         _listen_to_volatile(buffer, node)
         return cls(buffer, tf2_ros.TransformException, tuple(map(node.resolve_topic_name, (TF, TF_STATIC))))
 

@@ -9,7 +9,7 @@ from functools import partial
 from typing import Any, NamedTuple
 
 from nav_msgs.msg import Odometry
-from rclpy.event_handler import SubscriptionEventCallbacks
+from rclpy.event_handler import SubscriptionEventCallbacks, UnsupportedEventTypeError
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import Range
 
@@ -130,8 +130,12 @@ class Intake:
 
     def _subscribe(self, kind: Any, topic: str, reliability: str, callback: Any, losses: Losses) -> None:
         quality = QoSProfile(depth=QUEUE, reliability=ReliabilityPolicy[reliability.upper()])
-        events = SubscriptionEventCallbacks(message_lost=losses.reported)
-        made = self._node.create_subscription(kind, topic, callback, quality, event_callbacks=events)
+        subscribe = partial(self._node.create_subscription, kind, topic, callback, quality)
+        try:
+            made = subscribe(event_callbacks=SubscriptionEventCallbacks(message_lost=losses.reported))
+        except UnsupportedEventTypeError:
+            # a middleware need not report losses; those that `Losses` finds in the messages remain
+            made = subscribe()
         self._subscribed.append(made)
         self.subscriptions[self._node.resolve_topic_name(topic)] = quality
 

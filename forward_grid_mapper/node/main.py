@@ -111,6 +111,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     node = executor = None
     try:
         node = MapperNode()
+        for text in complaints.of_sections(arguments, node.get_fully_qualified_name()):
+            node.get_logger().warning(text)
         executor = SingleThreadedExecutor()
         executor.add_node(node)
         node.when_failed = lambda: executor.create_task(_raise_stop)

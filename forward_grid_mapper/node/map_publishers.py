@@ -129,6 +129,9 @@ class MapPublishers:
                 return
             grid, values = self._pending.pop(name)
         message = self._message(grid, values)
+        if grid is self._nothing[0] and not message.header.frame_id:
+            # after a reset that forgot the frame: subscribers such as Nav2 ignore a map without one, and keep the old
+            message.header.frame_id = self.latest[name].header.frame_id
         self.latest[name] = message
         if name == 'live_map' and self._updates:
             self._updates.publish(message)

@@ -145,6 +145,48 @@ def test_error_in_a_parameter_file_has_a_remedy(tmp_path: Path, text: str, why: 
     assert message.startswith(f'--params-file {file}: ') and expected in message
 
 
+@pytest.mark.parametrize(
+    ('text', 'names'),
+    [
+        # as `ros2 param dump` writes it for a node without a namespace
+        ('/forward_grid_mapper:\n  ros__parameters:\n    sensors:\n      a:\n        pose: [0.1, 0.0]', '/forward_'),
+        ('forward_grid_mapper: {ros__parameters: {p_hit: 0.5}}', '/forward_grid_mapper, but this node is /robot1/'),
+        ('robot2: {forward_grid_mapper: {ros__parameters: {p_hit: 0.5}}}', '/robot2/forward_grid_mapper'),
+        ('\n'.join(f'{name}: {{ros__parameters: {{}}}}' for name in 'abcd'), 'of /a, /b, /c and 1 more'),
+        ('/*: {ros__parameters: {p_hit: 0.5}}', '/*'),
+        ('/robot1/forward_grid_mapper: {ros__parameters: !!python/tuple {p_hit: 0.5}}', ''),
+        ('robot1: {forward_grid_mapper: {ros__parameters: {p_hit: 0.5}}}\namcl: {ros__parameters: {x: 1}}', ''),
+        ('/**: {ros__parameters: {p_hit: 0.5}}', ''),
+        ('/**/forward_grid_mapper: {ros__parameters: {p_hit: 0.5}}', ''),
+        ('/*/forward_grid_mapper: {ros__parameters: {p_hit: 0.5}}', ''),
+        ('/*/*: {ros__parameters: {p_hit: 0.5}}', ''),
+        ('? [1, 2]\n: 3', ''),
+        ('', ''),
+        ('a: b: c', ''),
+        ('a: &a {b: *a}', ''),
+    ],
+)
+def test_parameter_file_of_another_node_gives_a_warning(tmp_path: Path, text: str, names: str) -> None:
+    file = tmp_path / 'my.yaml'
+    file.write_text(text)
+    found = complaints.of_sections(['--ros-args', '--params-file', str(file)], '/robot1/forward_grid_mapper')
+    assert len(found) == bool(names)
+    assert all(names in line and 'into a section /** or /robot1/forward_grid_mapper' in line for line in found)
+    assert complaints.of_sections(['--params-file', '/nowhere.yaml', '--params-file'], '/a') == []
+
+
+def test_ros_reads_the_sections_that_give_no_warning(start: Any, tmp_path: Path) -> None:
+    files = []
+    for k, name in enumerate(('/**', '/**/forward_grid_mapper', '/*/forward_grid_mapper', '/forward_grid_mapper')):
+        files.append(tmp_path / f'{k}.yaml')
+        # each has a parameter that the node does not know
+        files[-1].write_text(f'{name}: {{ros__parameters: {{strange_{k}: 0.5}}}}')
+    options = [part for file in files for part in ('--params-file', str(file))]
+    node = start('-r', '__ns:=/robot1', *options)
+    assert [f'strange_{k} is not known' in node.output for k in range(4)] == [True, True, True, False]
+    assert [f'--params-file {file} is ignored' in node.output for file in files] == [False, False, False, True]
+
+
 def test_save_directory_of_an_unknown_user_fails_on_save(domain: int, tmp_path: Path) -> None:
     robot = Inside(domain, tmp_path, save_directory='~nobody_of_this_name/maps').start()
     try:

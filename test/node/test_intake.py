@@ -10,6 +10,7 @@ import pytest
 
 pytest.importorskip('rclpy', reason='the intake takes messages of ROS')
 
+from rclpy.event_handler import UnsupportedEventTypeError
 from rclpy.qos import ReliabilityPolicy
 from sensor_msgs.msg import Range
 from stand_ins import Taking
@@ -175,6 +176,22 @@ def test_topics_are_subscribed_once_and_unsubscribed() -> None:
     robot.range(101.0, number=500)
     robot.range(101.0, number=500, topic=1)
     assert intake.lost == 0
+
+
+def test_middleware_that_reports_no_losses_is_subscribed_all_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
+    """rclpy raises for a callback that the middleware does not support, if it is not one of rclpy's own."""
+    robot = Taking(range_topics=['left', 'right'])
+    create = robot.node.create_subscription
+
+    def without_losses(*arguments: Any, event_callbacks: Any = None) -> str:
+        if event_callbacks is not None and event_callbacks.message_lost:
+            raise UnsupportedEventTypeError('event type is not supported')
+        return create(*arguments)
+
+    monkeypatch.setattr(robot.node, 'create_subscription', without_losses)
+    robot.intake.subscribe()
+    assert list(robot.node.subscribed) == ['left', 'right', 'odom']
+    assert robot.intake.listening
 
 
 def test_topics_with_the_same_readings_are_named_until_it_forgets() -> None:

@@ -131,6 +131,23 @@ def test_map_is_published_and_kept(node: Publishing, maps: MapPublishers) -> Non
     assert maps.ml_map == (GRID, CELLS), 'only the ML map is'
 
 
+def test_map_of_nothing_replaces_the_old_one_even_if_the_frame_is_forgotten(node: Publishing) -> None:
+    """Nav2 rejects a map with an empty frame_id as malformed, and would keep the map that was deleted."""
+    frames = ['odom']
+    maps = MapPublishers(node, 0.1, lambda: frames[0], at_once)
+    maps.publish('ml_map', 0, GRID, CELLS)
+    assert answers(maps, 'ml_map')[0].header.frame_id == 'odom'
+    # as after `reset`, once odometry has come in another frame
+    frames[0] = ''
+    maps.clear()
+    (nothing,) = answers(maps, 'ml_map')
+    assert (nothing.info.width, nothing.info.height, nothing.header.frame_id) == (1, 1, 'odom')
+    assert ('~/ml_map', nothing) in node.sent
+    maps.publish('ml_map', 1, GRID, CELLS)
+    assert answers(maps, 'ml_map')[0].header.frame_id == '', 'the frame of a map is never guessed'
+    maps.worker.close(10.0)
+
+
 def test_only_the_newest_of_waiting_maps_is_published(node: Publishing, maps: MapPublishers) -> None:
     busy = Busy(maps)
     for width in (1, 2, 5):

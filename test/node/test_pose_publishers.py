@@ -51,6 +51,9 @@ def tf2_ros(monkeypatch: pytest.MonkeyPatch) -> type[Broadcaster]:
     """Stand-in for the parts of tf2_ros that the node uses; its buffer has no transforms."""
 
     class Buffer:
+        def __init__(self, cache_time: Any = None, node: Any = None) -> None:
+            pass
+
         def clear(self) -> None:
             pass
 
@@ -61,7 +64,7 @@ def tf2_ros(monkeypatch: pytest.MonkeyPatch) -> type[Broadcaster]:
         pass
 
     class TransformListener:
-        def __init__(self, buffer: Any, node: Any, *, spin_thread: bool = False) -> None:
+        def __init__(self, buffer: Any, node: Any, *, spin_thread: bool = False, qos: Any = None) -> None:
             pass
 
     # a message type that rclpy knows, with a field `transforms` as in TFMessage

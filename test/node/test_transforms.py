@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import gc
 import math
 import sys
+import weakref
 from collections.abc import Callable, Iterator
 from types import ModuleType, SimpleNamespace
 from typing import Any
@@ -15,10 +17,12 @@ pytest.importorskip('rclpy', reason='the tests of the node need rclpy')
 import rclpy
 from geometry_msgs.msg import Transform
 from inside import Inside
+from rclpy.callback_groups import ReentrantCallbackGroup
+from rclpy.lifecycle.node import TransitionCallbackReturn
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import MultiDOFJointState
 
-from forward_grid_mapper.node import frames, surroundings
+from forward_grid_mapper.node import frames, intake, surroundings
 
 VOLATILE = QoSProfile(depth=10, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.VOLATILE)
 WARN = b'\x01'
@@ -31,7 +35,8 @@ class TransformError(Exception):
 class Buffer:
     """Stand-in for `tf2_ros.Buffer`; each transform is the pose of the sensor on the robot."""
 
-    def __init__(self) -> None:
+    def __init__(self, cache_time: Any = None, node: Any = None) -> None:
+        self.cache_time = cache_time
         self.listener: Any = None
         self.transform: Any = None
 
@@ -48,11 +53,25 @@ class Buffer:
 
 
 class Listener:
-    """Stand-in for `tf2_ros.TransformListener`, with a transient local subscription."""
+    """Stand-in for `tf2_ros.TransformListener`: its subscriptions end with it, in a group of their own."""
 
-    def __init__(self, buffer: Any, node: Any, *, spin_thread: bool = False) -> None:
-        quality = QoSProfile(depth=100, durability=DurabilityPolicy.TRANSIENT_LOCAL)
-        node.create_subscription(MultiDOFJointState, '/tf_static', lambda message: None, quality)
+    def __init__(
+        self, buffer: Any, node: Any, *, spin_thread: bool = False, qos: Any = None, static_qos: Any = None
+    ) -> None:
+        assert not spin_thread
+        self.buffer, self.node, self.group = buffer, node, ReentrantCallbackGroup()
+        volatile = qos or QoSProfile(depth=100, durability=DurabilityPolicy.VOLATILE)
+        latched = static_qos or QoSProfile(depth=100, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+        self.tf_sub, self.tf_static_sub = (
+            node.create_subscription(
+                MultiDOFJointState, topic, lambda message: None, quality, callback_group=self.group
+            )
+            for topic, quality in (('/tf', volatile), ('/tf_static', latched))
+        )
+
+    def __del__(self) -> None:
+        self.node.destroy_subscription(self.tf_sub)
+        self.node.destroy_subscription(self.tf_static_sub)
 
 
 @pytest.fixture(autouse=True)
@@ -115,6 +134,34 @@ def test_volatile_static_transforms_are_received(inside: Callable[..., Inside], 
     from_tower(robot, 0, 5)
     assert len(robot.node.associator.buffer) == 5
     assert 'volatile' not in robot.status('readings')['message']
+
+
+def test_clean_up_ends_the_listener_and_configure_makes_another(inside: Callable[..., Inside]) -> None:
+    """The subscriptions are destroyed by the clean-up, and once more by the listener when it is collected."""
+    robot = begun(inside)
+    node = robot.node
+
+    def of_transforms() -> list[str]:
+        return sorted(each.topic_name for each in node.subscriptions if each.msg_type is MultiDOFJointState)
+
+    for _ in range(2):
+        assert of_transforms() == ['/tf', '/tf_static', '/tf_static']
+        listener = weakref.ref(node._extrinsics._transforms._buffer.listener)
+        assert node.trigger_deactivate() == node.trigger_cleanup() == TransitionCallbackReturn.SUCCESS
+        robot.spin(0.1)
+        gc.collect()
+        assert listener() is None and of_transforms() == []
+        robot.start()
+
+
+def test_transforms_wait_for_the_node_as_long_as_readings_do(inside: Callable[..., Inside]) -> None:
+    robot = inside()
+    robot.node.start()
+    buffer: Any = robot.node._extrinsics._transforms._buffer
+    assert buffer.cache_time.nanoseconds == frames.KEPT * 10**9
+    of_tf = buffer.listener.tf_sub.qos_profile
+    assert (of_tf.depth, of_tf.durability) == (intake.QUEUE, DurabilityPolicy.VOLATILE)
+    assert of_tf.reliability == ReliabilityPolicy.RELIABLE
 
 
 def test_static_transforms_published_too_early_are_reported(
