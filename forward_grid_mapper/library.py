@@ -219,7 +219,7 @@ def make_maps(
         *arrays.ambiguous_stamps(odometry),
         *alternation_note(associator),
         *_pose_warnings(associator),
-        *associator.limits.warnings(),
+        *associator.message_warnings(),
         *rejection_warnings(associator.rejected, len(values), 'ranges'),
         *sensor_rejections(associator.rejected_by_frame, associator.buffer.counts()),
         *thinning_note(associator),

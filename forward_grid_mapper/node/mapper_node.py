@@ -374,7 +374,7 @@ class MapperNode(ManagedNode):
                 'lost': self.intake.lost,
             },
             'warnings': [
-                *associator.limits.warnings(),
+                *associator.message_warnings(),
                 *self.intake.loss_note(),
                 *self.intake.repeated(),
                 *rejections,

@@ -79,7 +79,7 @@ class Reporter:
         faults = [*self._intake.faults(), *self._surroundings.faults(), *self._no_frame_id()]
         counts = self._associator.buffer.counts()
         limits = [
-            *self._associator.limits.warnings(),
+            *self._associator.message_warnings(),
             *sensor_rejections(self._associator.rejected_by_frame, counts, OF_POSES),
         ]
         # faults of frames are logged by the functions that detect them

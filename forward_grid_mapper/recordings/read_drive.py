@@ -313,7 +313,7 @@ def _warnings(bag: Bag, associator: PoseAssociator, lookup: Extrinsics) -> list[
             'were dropped'
         )
     warnings += alternation_note(associator)
-    warnings += associator.limits.warnings()
+    warnings += associator.message_warnings()
     for reason, count in associator.odometry_rejected.items():
         warnings.append(
             f'{count} of {associator.odometry_received} odometry messages were rejected: {ODOMETRY_REASONS[reason]}'

@@ -87,6 +87,7 @@ class BatchAssociator(PoseAssociator):
         newest = self._history.newest
         self._take_odometry(odometry)
         self.limits.add_all(ranges)
+        self.missing.add_all(ranges)
         measured = measure_all(ranges, self.parameters)
         frames = list(ranges.frames)
         good = measured.reason == ''

@@ -10,14 +10,13 @@ from __future__ import annotations
 import numpy as np
 
 from ..common.readings import Floats
+from .message_account import MOST_FRAMES
 from .message_batch import Ranges
 from .message_types import RangeMessage
+from .rep117 import proper_name
 
 SAMPLES = 256
 """Most messages of a sensor that are sampled; they are spread over the whole drive."""
-
-MOST_SENSORS = 256
-"""Most sensors that are sampled, by the name of their frame; it bounds the memory."""
 
 ENOUGH = 30
 """Fewest messages for a check."""
@@ -102,24 +101,19 @@ class LimitWatch:
 
     def add(self, message: RangeMessage) -> None:
         """Take a message."""
-        samples = self._samples(message.frame_id)
-        if samples is not None:
+        if samples := self._samples(message.frame_id):
             samples.add(message.range, message.min_range, message.max_range)
 
     def add_all(self, messages: Ranges) -> None:
         """Apply `add` to many messages."""
         values = np.stack([messages.range, messages.min_range, messages.max_range], axis=1)
-        order = np.argsort(messages.frame, kind='stable')
-        first = np.searchsorted(messages.frame[order], np.arange(len(messages.frames) + 1))
-        for number, frame in enumerate(messages.frames):
-            part = values[order[first[number] : first[number + 1]]]
-            samples = self._samples(frame) if len(part) else None
-            if samples is not None:
-                samples.add_all(part)
+        for frame, part in messages.of_each():
+            if samples := self._samples(frame):
+                samples.add_all(values[part])
 
     def _samples(self, frame: str) -> _Samples | None:
-        """Return the samples of a sensor; None if there are too many sensors."""
-        if frame not in self._of and len(self._of) < MOST_SENSORS:
+        """Return the samples of a sensor; None if its name is none, or if there are too many sensors."""
+        if frame not in self._of and len(self._of) < MOST_FRAMES and proper_name(frame):
             self._of[frame] = _Samples()
         return self._of.get(frame)
 

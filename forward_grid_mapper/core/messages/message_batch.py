@@ -45,6 +45,14 @@ class Ranges(NamedTuple):
     variance: Floats
     frames: tuple[str, ...]
 
+    def of_each(self) -> Iterator[tuple[str, Ints]]:
+        """Yield each frame that has messages, and their indices in the order of the batch."""
+        order = np.argsort(self.frame, kind='stable')
+        first = np.searchsorted(self.frame[order], np.arange(len(self.frames) + 1))
+        for number, frame in enumerate(self.frames):
+            if len(part := order[first[number] : first[number + 1]]):
+                yield frame, part
+
     def one_by_one(self) -> Iterator[tuple[int, RangeMessage]]:
         """Yield places and messages."""
         columns = (column.tolist() for column in self[:8])

@@ -22,6 +22,7 @@ from .limit_watch import LimitWatch
 from .map_extent import MapExtent, possible
 from .message_account import MessageAccount
 from .message_types import NANOSECONDS, OdometryMessage, Pose2, RangeMessage
+from .missing_readings import MissingReadings
 from .pose_history import PoseHistory
 from .reading_buffer import ReadingBuffer
 from .rep117 import LONGEST_NAME, Measurement, measure
@@ -54,7 +55,9 @@ class PoseAssociator(MessageAccount):
     record : OdometryRecord
         Of all poses of odometry.
     limits : LimitWatch
-        Warns of ranges and limits in different units.
+        Looks for ranges and limits in different units.
+    missing : MissingReadings
+        Looks for readings without an echo that the driver leaves out.
     """
 
     def __init__(
@@ -91,7 +94,7 @@ class PoseAssociator(MessageAccount):
         self._extent = MapExtent()
         self._patient = patient
         self.buffer = ReadingBuffer(self.parameters.max_readings)
-        self.limits = LimitWatch()
+        self.limits, self.missing = LimitWatch(), MissingReadings()
         self.map_frame = self.base_frame = ''
         self._waiting: list[Measurement] = []
         self._path, self._history = RobotPath(), PoseHistory(patient)
@@ -142,10 +145,15 @@ class PoseAssociator(MessageAccount):
         stamps = self.buffer.snapshot().stamp
         return self.record.snapshot(int(stamps.min()) if len(stamps) else None)
 
+    def message_warnings(self) -> list[str]:
+        """Return warnings about the Range messages so far; empty if there is no suspicion."""
+        return [*self.limits.warnings(), *self.missing.warnings()]
+
     def add_range(self, message: RangeMessage, sent: int = 0) -> None:
         """Take one Range message; `sent` is when it was published, nanoseconds of the system's clock, 0 if unknown."""
         self.received += 1
         self.limits.add(message)
+        self.missing.add(message)
         measured = measure(message, self.parameters)
         if isinstance(measured, str):
             self._reject(message.frame_id, measured)
@@ -171,6 +179,7 @@ class PoseAssociator(MessageAccount):
         self.record.begin_anew()
         self.buffer.clear()
         self.limits.clear()
+        self.missing.clear()
         self.begin_account()
         self._waiting.clear()
         self._held.clear()

@@ -63,7 +63,7 @@ def circling() -> Messages:
 def warnings_of(messages: Messages) -> list[str]:
     """The warnings about a drive, of the node and offline."""
     associator = associated(*messages)
-    return [*associator.limits.warnings(), *input_warnings(associator.readings)]
+    return [*associator.message_warnings(), *input_warnings(associator.readings)]
 
 
 def stopped(frame: str) -> Messages:
@@ -84,6 +84,12 @@ def of_one(given: Messages, by: float) -> Messages:
     """A drive in which the driver of one sensor sends ranges in another unit."""
     frame = sorted(given.extrinsics)[2]
     return given.with_ranges(lambda m: m._replace(range=m.range * by) if m.frame_id == frame else m)
+
+
+def without_silence(limit: float) -> Messages:
+    """The drive in circles with a shorter max_range, and a driver that sends nothing if there is no echo."""
+    given = circling().with_ranges(lambda m: m._replace(max_range=limit))
+    return given._replace(ranges=[m for m in given.ranges if m.range < limit])
 
 
 def twice() -> Messages:
@@ -233,6 +239,10 @@ SCENARIOS: dict[str, tuple[Callable[[], Messages], str]] = {
         lambda: of_one(circling(), 100),
         r'^sensor sonar_2: \d+ of \d+ examined ranges .* are the ranges in centimetres and the limits in metres',
     ),
+    'readings without an echo are left out': (
+        lambda: without_silence(3.0),
+        'sensors sonar_5, sonar_6, sonar_7 send nothing for up to .* readings without an echo',
+    ),
     'min_range in centimetres': (
         lambda: drive().with_ranges(lambda m: m._replace(min_range=2.0)),
         r'below min_range \(2 m\).*are the limits in centimetres',
@@ -297,7 +307,7 @@ def test_real_recordings_give_no_warning(shared: Path, name: str, odometry: str)
     if not bag.exists():
         pytest.skip(f'{bag} is not there')
     found = read_drive(bag, Parameters(), {}, None, odometry)
-    assert found.associator.limits.warnings() == []
+    assert found.associator.message_warnings() == []
     assert input_warnings(found.associator.readings) == []
 
 

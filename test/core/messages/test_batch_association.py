@@ -17,7 +17,8 @@ from forward_grid_mapper.core.common.parameters import Parameters
 from forward_grid_mapper.core.common.readings import Readings
 from forward_grid_mapper.core.messages.batch_association import BatchAssociator
 from forward_grid_mapper.core.messages.extrinsics import STEEP, Mount
-from forward_grid_mapper.core.messages.limit_watch import MOST_SENSORS, LimitWatch
+from forward_grid_mapper.core.messages.limit_watch import LimitWatch
+from forward_grid_mapper.core.messages.message_account import MOST_FRAMES
 from forward_grid_mapper.core.messages.message_batch import batch_of
 from forward_grid_mapper.core.messages.message_types import NANOSECONDS, OdometryMessage, Pose2, RangeMessage
 from forward_grid_mapper.core.messages.pose_association import PoseAssociator
@@ -117,7 +118,7 @@ def state_of(made: PoseAssociator) -> dict[str, Any]:
         'path': made.path,
         'counts': list(made.buffer.counts().items()),
         'held': made.buffer.held,
-        'warnings': made.limits.warnings(),
+        'warnings': made.message_warnings(),
     }
 
 
@@ -225,11 +226,11 @@ def test_limits_of_a_batch_are_checked_as_for_single_messages(sizes: list[int]) 
 
 def test_limits_of_too_many_sensors_are_not_watched() -> None:
     one, many = LimitWatch(), LimitWatch()
-    messages = [RangeMessage(0, f's{k}', 100.0, 0.1, 5.0, 0.3) for k in range(2 * MOST_SENSORS)]
+    messages = [RangeMessage(0, f's{k}', 100.0, 0.1, 5.0, 0.3) for k in range(2 * MOST_FRAMES)]
     for message in messages:
         one.add(message)
     many.add_all(batch_of(list(enumerate(messages))).ranges)
-    assert len(one._of) == len(many._of) == MOST_SENSORS
+    assert len(one._of) == len(many._of) == MOST_FRAMES
 
 
 def test_batch_yields_its_messages_in_order() -> None:
