@@ -18,6 +18,7 @@ from typing import TextIO
 
 from .. import __version__
 from ..core.common.errors import MapperError
+from ..core.common.words import printable
 from ..core.runtime.compiling import compiling
 from ..core.search.search import Progress
 from .signals import Cancelled, Interruptible, cancelled_line
@@ -68,7 +69,7 @@ def run(
     except KeyboardInterrupt:
         print(cancelled_line(parser.prog), file=sys.stderr)
         return 130
-    print(f'{parser.prog}: error: {problem}', file=sys.stderr)
+    print(f'{parser.prog}: error: {printable(str(problem))}', file=sys.stderr)
     return 1
 
 
@@ -168,7 +169,12 @@ class Ticker:
                 continue
             if seconds >= LONG and self._warnings:
                 before = '\r\033[K' if on_screen else ''
-                print(*(f'{before}warning: {text}' for text in self._warnings), sep='\n', file=self._stream, flush=True)
+                print(
+                    *(f'{before}warning: {printable(text)}' for text in self._warnings),
+                    sep='\n',
+                    file=self._stream,
+                    flush=True,
+                )
                 self._warnings = []
             # the note on compilation is shown until the next stage, so that the line does not flicker
             self._compiles = self._compiles or compiling()

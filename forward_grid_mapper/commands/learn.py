@@ -12,6 +12,7 @@ from pathlib import Path
 
 from ..core.common.errors import OutputError, ParameterError
 from ..core.common.shell import command_line
+from ..core.common.words import printable
 from ..core.cross_validation import only_if_validated
 from ..core.joint_learning import learn_jointly
 from ..core.learning.sensor_health import health_warning, sensor_health
@@ -128,7 +129,7 @@ def learn(options: argparse.Namespace) -> int:
         print_json({'file': output and readable(output), **learned_data(found)})
     elif options.quiet:
         for warning in warnings:
-            print(f'{COMMAND}: warning: {warning}', file=sys.stderr)
+            print(f'{COMMAND}: warning: {printable(warning)}', file=sys.stderr)
     else:
         print(learned_text(found), end='')
     if output is not None:

@@ -16,6 +16,7 @@ from typing import Any
 from ..core.common.errors import ParameterError
 from ..core.common.parameters import Parameters
 from ..core.common.shell import module_line
+from ..core.common.words import printable
 from ..core.joint_learning import map_and_learn
 from ..core.mapping import Mapper
 from ..core.maps.map_set import MapSet
@@ -200,7 +201,7 @@ def tell(options: argparse.Namespace, report: Mapping[str, Any], output: Path) -
         print(report_text(dict(report)), end='')
     else:
         for warning in report['warnings']:
-            print(f'{COMMAND}: warning: {warning}', file=sys.stderr)
+            print(f'{COMMAND}: warning: {printable(warning)}', file=sys.stderr)
     print(f'maps are in {output}')
     if options.rerun and not options.quiet:
         print(f'play the drive with\n  {module_line("rerun", output / RECORDING)}')

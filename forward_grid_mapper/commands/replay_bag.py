@@ -14,7 +14,7 @@ from ..bags.choice import ODOMETRY, RANGE
 from ..bags.decoder import TF_MESSAGE
 from ..bags.reader import Bag, skipped
 from ..core.common.errors import MapperError
-from ..core.common.words import counted
+from ..core.common.words import counted, printable
 from ..replay.player import CLOCK, Player
 from ..replay.publishers import Publishers, renamed
 from ..replay.ros_messages import MISFITS, message_class, static_transforms
@@ -160,7 +160,7 @@ def _warn(bag: Bag, player: Player) -> None:
 
 
 def _print_warning(text: str) -> None:
-    print(f'{COMMAND}: warning: {text}', file=sys.stderr)
+    print(f'{COMMAND}: warning: {printable(text)}', file=sys.stderr)
 
 
 def _positive(text: str) -> float:

@@ -8,7 +8,7 @@ from collections.abc import Iterator
 from datetime import datetime, timezone
 from typing import Any
 
-from ..core.common.words import counted
+from ..core.common.words import counted, printable
 
 UNTESTED = (
     'the drive may not determine these values; process_bag --refine-poses reports those that it determines, with their '
@@ -31,7 +31,7 @@ def report_text(data: dict[str, Any]) -> str:
     for section in sections:
         if lines := list(section(data)):
             parts.append('\n'.join(lines))
-    return '\n\n'.join(parts) + '\n'
+    return printable('\n\n'.join(parts)) + '\n'
 
 
 def _warnings(data: dict[str, Any]) -> Iterator[str]:

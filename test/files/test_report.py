@@ -152,3 +152,8 @@ def test_sensors_have_the_readings_used_if_max_readings_leaves_out_some() -> Non
         data = report_data(maps, {'counts': {'received': accepted, 'accepted': accepted}})
         row = next(line for line in report_text(data).splitlines() if line.startswith('Sensors'))
         assert row.split()[:2] == ['Sensors', head]
+
+
+def test_names_that_control_a_terminal_are_escaped() -> None:
+    text = report_text({'input': {**SOURCE, 'range_topics': ('/\x1b[31mred', '/ä\u202e')}})
+    assert '/\\x1b[31mred, /ä\\u202e' in text and text.replace('\n', '').isprintable()
