@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from typing import NamedTuple
 
@@ -70,6 +71,8 @@ class IndexedReadings:
     ) -> None:
         """Begin without readings, on the map `occupied` (1 occupied, shape `grid.shape`)."""
         self.grid, self.model, self._threads = grid, model, threads
+        # its threads begin when they are needed, and end with this object; starting them each time takes longer
+        self._pool = ThreadPoolExecutor(threads)
         self._words = int(min(memory / WORD, 2.0**60))
         self._totals = np.zeros(6, np.int64)
         self._size = self._indexed = 0
@@ -160,7 +163,7 @@ class IndexedReadings:
             # with fewer threads, the result is the same
             pass
         portions = zip(own, parts(begin, end, len(own)), strict=True)
-        run_each([partial(work, s, first, last, array) for (s, array), (first, last) in portions])
+        run_each([partial(work, s, first, last, array) for (s, array), (first, last) in portions], self._pool)
         check(self.state.stop)
         for _, array in own[1:]:
             np.add(total, array, out=total)
