@@ -58,9 +58,8 @@ def promising(s: State, prior: Prior, least: Least, window: tuple[int, int, int,
     """
     maps, width = s.maps, s.lattice.width
     occupied, evidence, seen, pattern = maps.occupied, maps.evidence, maps.seen, maps.pattern
-    # least evidence for a flip of a free cell without neighbours, since its prior is at most 0; nearly all have less,
-    # and are skipped
-    floor = np.int64((least[0] - prior.shape[0]) / s.model.nats) - 1
+    # least evidence for a flip of a free cell without neighbours; nearly all have less, and are skipped
+    floor = np.int64((least[0] - prior.most - prior.shape[0]) / s.model.nats) - 1
     n = 0
     for row in range(window[0], window[1]):
         end = row * width + window[3]
@@ -99,6 +98,7 @@ def highest(s: State, cells: NDArray[np.int64], gains: Floats, workspace: Floats
             o = neighbour(cells[i], k, height, width)
             if o >= 0 and (workspace[o] > gains[i] or (workspace[o] == gains[i] and o < cells[i])):
                 chosen[i] = False
+                break
     for i in range(len(cells)):
         workspace[cells[i]] = 0.0
     return chosen

@@ -178,7 +178,7 @@ class Search:
             if converged and not self.progress.flips and not self.progress.shifts:
                 return self._result(converged)
             self._prior = independent
-            self._settled[:] = 0
+            self._unsettle_all()
         while self._more() and self._update_in_parallel(watch):
             pass
         return self.refine(watch)
@@ -188,7 +188,7 @@ class Search:
         converged = self._climb(watch)
         if has_walls(self._parameters):
             self._prior = self._of_walls
-            self._settled[:] = 0
+            self._unsettle_all()
             converged = self._climb(watch)
         return self._result(converged)
 
@@ -225,11 +225,9 @@ class Search:
         return cells[(left <= column) & (column < right)]
 
     def _promising(self) -> tuple[NDArray[np.int64], Floats]:
-        """Return the cells whose flip gains, the largest gain first, and the gains."""
+        """Return the cells whose flip gains, in the order of the map, and the gains; valid until the next call."""
         n = promising(self.evidence.state, self._prior, LEAST, self._window, self._gaining, self._gains)
-        cells, gains = self._gaining[:n], self._gains[:n]
-        order = np.argsort(-gains, kind='stable')
-        return cells[order], gains[order]
+        return self._gaining[:n], self._gains[:n]
 
     def _update_in_parallel(self, watch: Watch) -> bool:
         """Flip all cells that gain more than their neighbours; return whether another such update is worth while."""
@@ -250,7 +248,9 @@ class Search:
         cells, gains = self._promising()
         if not len(cells):
             return 0
-        flips, gain = flip_in_order(self.evidence.state, self._prior, LEAST, cells, gains)
+        # the largest gain first
+        order = np.argsort(-gains, kind='stable')
+        flips, gain = flip_in_order(self.evidence.state, self._prior, LEAST, cells[order], gains[order])
         self._advance(flips, 0, gain, watch)
         return flips
 
@@ -259,6 +259,10 @@ class Search:
         with suppress(IndexError):
             return self._all_none.pop()
         return np.full(self.evidence.grid.size, -1, np.int32)
+
+    def _unsettle_all(self) -> None:
+        self._settled[:] = 0
+        self._tried_at = -1
 
     def _shift(self, watch: Watch) -> int:
         evidence, s = self.evidence, self.evidence.state
