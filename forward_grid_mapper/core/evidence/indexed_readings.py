@@ -21,7 +21,7 @@ from .fixed_point import QUANTUM
 from .indexing import BAND, FREE, LARGEST, UNSTORED, WORDS, insert_readings
 from .neighbourhood import set_patterns
 from .pairs import WORD, Lattice, empty_pairs, workspace_for
-from .state import READING_STATE, Maps, Model, State, Work
+from .state import BLOCK_SHIFT, READING_STATE, Maps, Model, State, Work
 from .tile_index import more_chunks, no_tiles
 from .updates import forget
 
@@ -45,7 +45,7 @@ def empty_maps(grid: Grid, occupied: NDArray[np.uint8]) -> Maps:
     seen, evidence = np.zeros(grid.size, np.int32), np.zeros(grid.size, np.int64)
     pattern = np.zeros(grid.size, np.uint8)
     set_patterns(occupied.ravel(), grid.shape, pattern)
-    return Maps(occupied.ravel(), evidence, seen, pattern)
+    return Maps(occupied.ravel(), evidence, seen, pattern, np.ones((grid.size >> BLOCK_SHIFT) + 1, np.uint8))
 
 
 class IndexedReadings:
