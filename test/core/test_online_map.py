@@ -414,7 +414,8 @@ def state_of(online: OnlineMap) -> State:
     evidence = online._evidence
     s, n = evidence.state, len(online)
     window = evidence.grid.window(online.grid)
-    arrays = [getattr(s.maps, name).reshape(evidence.grid.shape)[window].copy() for name in s.maps._fields]
+    of_cells = (s.maps.occupied, s.maps.evidence, s.maps.seen, s.maps.pattern)
+    arrays = [values.reshape(evidence.grid.shape)[window].copy() for values in of_cells]
     arrays += [s.reading_states[name][:n].copy() for name in ('multiplicity', 'occupy', 'release', 'likelihood')]
     if len(s.normals.known):
         arrays.append(s.normals.known.reshape(evidence.grid.shape)[window].copy())

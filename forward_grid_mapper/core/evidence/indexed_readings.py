@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from typing import NamedTuple
 
@@ -20,7 +21,7 @@ from .fixed_point import QUANTUM
 from .indexing import BAND, FREE, LARGEST, UNSTORED, WORDS, insert_readings
 from .neighbourhood import set_patterns
 from .pairs import WORD, Lattice, empty_pairs, workspace_for
-from .state import READING_STATE, Maps, Model, State, Work
+from .state import BLOCK_SHIFT, READING_STATE, Maps, Model, State, Work
 from .tile_index import more_chunks, no_tiles
 from .updates import forget
 
@@ -44,7 +45,7 @@ def empty_maps(grid: Grid, occupied: NDArray[np.uint8]) -> Maps:
     seen, evidence = np.zeros(grid.size, np.int32), np.zeros(grid.size, np.int64)
     pattern = np.zeros(grid.size, np.uint8)
     set_patterns(occupied.ravel(), grid.shape, pattern)
-    return Maps(occupied.ravel(), evidence, seen, pattern)
+    return Maps(occupied.ravel(), evidence, seen, pattern, np.ones((grid.size >> BLOCK_SHIFT) + 1, np.uint8))
 
 
 class IndexedReadings:
@@ -70,6 +71,8 @@ class IndexedReadings:
     ) -> None:
         """Begin without readings, on the map `occupied` (1 occupied, shape `grid.shape`)."""
         self.grid, self.model, self._threads = grid, model, threads
+        # its threads begin when they are needed, and end with this object; starting them each time takes longer
+        self._pool = ThreadPoolExecutor(threads)
         self._words = int(min(memory / WORD, 2.0**60))
         self._totals = np.zeros(6, np.int64)
         self._size = self._indexed = 0
@@ -160,7 +163,7 @@ class IndexedReadings:
             # with fewer threads, the result is the same
             pass
         portions = zip(own, parts(begin, end, len(own)), strict=True)
-        run_each([partial(work, s, first, last, array) for (s, array), (first, last) in portions])
+        run_each([partial(work, s, first, last, array) for (s, array), (first, last) in portions], self._pool)
         check(self.state.stop)
         for _, array in own[1:]:
             np.add(total, array, out=total)

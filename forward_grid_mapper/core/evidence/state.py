@@ -72,6 +72,10 @@ class Model(NamedTuple):
     nats: float
 
 
+BLOCK_SHIFT = 6
+"""Cells whose flips are tested together are a block: 64 in the order of the map."""
+
+
 class Maps(NamedTuple):
     """The state of the cells.
 
@@ -86,12 +90,16 @@ class Maps(NamedTuple):
         angle there.
     pattern : uint8
         Pattern of its occupied neighbours (`neighbourhood`).
+    touched : uint8, shape (blocks,)
+        1 for each block of 2 ** `BLOCK_SHIFT` cells in which single flips may have changed the gain of a flip. The
+        search sets it to 0 when it has listed the flips that gain.
     """
 
     occupied: NDArray[np.uint8]
     evidence: NDArray[np.int64]
     seen: NDArray[np.int32]
     pattern: NDArray[np.uint8]
+    touched: NDArray[np.uint8]
 
 
 class State(NamedTuple):

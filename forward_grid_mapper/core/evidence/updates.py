@@ -29,7 +29,7 @@ from ..sensor.surface_normals import exceeds_incidence_angle
 from .fixed_point import quantise_logs
 from .neighbourhood import note_flip
 from .pairs import WORDS_PER_RUN, Lattice, Pairs, Workspace, make
-from .state import Maps, Model, State
+from .state import BLOCK_SHIFT, Maps, Model, State
 from .tile_index import CHUNK, SHIFT
 
 EDGE = 1e-6
@@ -349,6 +349,28 @@ def find_observing(s: State, c: int) -> int:
     return n
 
 
+@inlined_kernel
+def _touch_around(s: State, c: int) -> None:
+    """Mark the blocks of the cells whose prior depends on cell c: up to two rows and columns away."""
+    row, column = c // s.lattice.width, c % s.lattice.width
+    left, right = max(column - 2, 0), min(column + 2, s.lattice.width - 1)
+    for other in range(max(row - 2, 0), min(row + 2, s.lattice.height - 1) + 1):
+        s.maps.touched[(other * s.lattice.width + left) >> BLOCK_SHIFT] = 1
+        s.maps.touched[(other * s.lattice.width + right) >> BLOCK_SHIFT] = 1
+
+
+@inlined_kernel
+def _touch_cone(reading_state: Any, pairs: Pairs, at: int, touched: Any) -> None:
+    """Mark the blocks of the cells of a reading."""
+    shift, cell = np.uint64(BLOCK_SHIFT), np.uint64(at + WORDS_PER_RUN * reading_state.runs)
+    for k in range(np.uint64(at), cell, np.uint64(WORDS_PER_RUN)):
+        first, last = np.uint64(pairs.cell[k]), np.uint64(pairs.cell[k + np.uint64(1)])
+        for block in range(first >> shift, (last >> shift) + np.uint64(1)):
+            touched[block] = 1
+    for k in range(np.uint64(reading_state.bands)):
+        touched[np.uint64(pairs.cell[cell + k]) >> shift] = 1
+
+
 @kernel
 def flip(s: State, c: int) -> None:
     """Flip cell c and update the evidence of all cells."""
@@ -363,6 +385,7 @@ def flip(s: State, c: int) -> None:
     maps.evidence[c] += -own if maps.occupied[c] else own
     maps.occupied[c] ^= 1
     note_flip(maps.pattern, c, s.lattice.height, s.lattice.width)
+    _touch_around(s, c)
     step = 1 if maps.occupied[c] else -1
     s.clock[0] += 1
     for i in range(n):
@@ -377,4 +400,5 @@ def flip(s: State, c: int) -> None:
             reading_state.through = s.model.mixture_weight * (1.0 - s.model.p_hit) ** reading_state.blocking
         evaluate(s.model, reading_state, maps.occupied, pairs, at, s.workspace)
         _add_difference(reading_state, pairs, at, maps, s.workspace.new)
+        _touch_cone(reading_state, pairs, at, maps.touched)
         reading_state.changed = s.clock[0]

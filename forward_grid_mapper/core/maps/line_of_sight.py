@@ -24,7 +24,6 @@ from numpy.typing import NDArray
 from ..common.constants import IMAGE_AROUND, LEAST_IN_SIGHT, LEAST_STRENGTH, SAME_WALL, THROUGH
 from ..evidence.evidence import Evidence
 from ..evidence.state import State
-from ..runtime.cancelling import check
 from ..runtime.jit import inlined_kernel, kernel
 from ..sensor.cone import rows_of, runs_of, strength
 from ..sensor.cone_table import cone_of
@@ -85,10 +84,13 @@ def add_echoes(s: State, begin: int, end: int, occupied: Any, same_wall: float, 
 
 
 @kernel
-def remove_passed(s: State, end: int, occupied: Any, cells: Any) -> None:
-    """Unset those `cells` (bool, shape (cells,)) that one of the first `end` readings passed in line of sight."""
+def remove_passed(s: State, begin: int, end: int, occupied: Any, cells: Any) -> None:
+    """Unset those `cells` (bool, shape (cells,)) that one of the readings `begin` to `end` passed in line of sight.
+
+    Threads may share `cells`, since cells are never set.
+    """
     width = s.lattice.width
-    for t in range(end):
+    for t in range(begin, end):
         if s.stop[0]:
             break
         reading = s.cones[t]
@@ -107,7 +109,8 @@ def remove_passed(s: State, end: int, occupied: Any, cells: Any) -> None:
                     distance = math.sqrt(u * u + v * v)
                     if distance > through or strength(reading.axis_x, reading.axis_y, sine2, u, v) < LEAST_STRENGTH:
                         continue
-                    cells[c] = not in_line_of_sight(reading, u, v, distance - 1.0, occupied, s.lattice)
+                    if in_line_of_sight(reading, u, v, distance - 1.0, occupied, s.lattice):
+                        cells[c] = False
 
 
 @kernel
@@ -146,7 +149,10 @@ def mirror_images(evidence: Evidence, cells: NDArray[np.bool_]) -> NDArray[np.bo
 def not_passed(evidence: Evidence, cells: NDArray[np.bool_]) -> NDArray[np.bool_]:
     """Return which of some cells no reading passed in line of sight, shape `grid.shape`."""
     remaining = cells.ravel().copy()
-    # single-threaded: once a reading passed a cell, the others are skipped
-    remove_passed(evidence.state, len(evidence), evidence.state.maps.occupied, remaining)
-    check(evidence.state.stop)
+
+    def work(s: State, begin: int, end: int, own: NDArray[np.int64]) -> None:
+        # shared by all threads: once a reading passed a cell, the others are skipped
+        remove_passed(s, begin, end, s.maps.occupied, remaining)
+
+    evidence.summed(0, len(evidence), work, np.zeros(0, np.int64))
     return remaining.reshape(evidence.grid.shape)

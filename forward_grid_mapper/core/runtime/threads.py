@@ -6,7 +6,7 @@ import itertools
 import math
 import os
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import ThreadPoolExecutor, wait
 from pathlib import Path
 
 from .control_groups import control_groups
@@ -46,11 +46,15 @@ def parts(begin: int, end: int, threads: int) -> list[tuple[int, int]]:
     return list(itertools.pairwise(edges))
 
 
-def run_each(work: list[Callable[[], None]]) -> None:
-    """Run each of `work` in its own thread, and wait for all; raise the exception of the first one that failed."""
+def run_each(work: list[Callable[[], None]], pool: ThreadPoolExecutor) -> None:
+    """Run each of `work` in a thread of the pool, and wait for all; raise the exception of the first one that failed.
+
+    The pool needs a thread for each. Single work runs in the calling thread.
+    """
     if len(work) == 1:
         work[0]()
         return
-    with ThreadPoolExecutor(len(work)) as pool:
-        for done in [pool.submit(job) for job in work]:
-            done.result()
+    running = [pool.submit(job) for job in work]
+    wait(running)
+    for done in running:
+        done.result()

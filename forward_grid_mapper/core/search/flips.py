@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from ..common.readings import Floats
 from ..evidence.neighbourhood import NEIGHBOURS, neighbour
-from ..evidence.state import State
+from ..evidence.state import BLOCK_SHIFT, State
 from ..evidence.updates import flip
 from ..runtime.jit import allocating_kernel, inlined_kernel, kernel
 from .prior import Prior, prior_gain
@@ -36,10 +36,6 @@ def least_gain(s: State, least: Least, c: int) -> float:
     return float(least[0] + least[1] * s.maps.seen[c])
 
 
-BLOCK = 64
-"""Cells of a row that are tested together."""
-
-
 @inlined_kernel
 def any_above(evidence: Any, occupied: Any, pattern: Any, floor: Any, begin: int, end: int) -> bool:
     """Return whether any of some cells has evidence above `floor`, or is occupied, or has an occupied neighbour."""
@@ -52,21 +48,20 @@ def any_above(evidence: Any, occupied: Any, pattern: Any, floor: Any, begin: int
 
 @kernel
 def promising(s: State, prior: Prior, least: Least, window: tuple[int, int, int, int], cells: Any, gains: Any) -> int:
-    """List the cells whose flip gains more than `least`, and the gains; return their number.
+    """List the cells in `touched` blocks whose flip gains more than `least`, and the gains; return their number.
 
-    `window` has begin and end of the rows, and of the columns.
+    `window` has begin and end of the rows, and of the columns. Its blocks are no longer `touched` then.
     """
     maps, width = s.maps, s.lattice.width
     occupied, evidence, seen, pattern = maps.occupied, maps.evidence, maps.seen, maps.pattern
-    # least evidence for a flip of a free cell without neighbours, since its prior is at most 0; nearly all have less,
-    # and are skipped
-    floor = np.int64((least[0] - prior.shape[0]) / s.model.nats) - 1
+    # least evidence for a flip of a free cell without neighbours; nearly all have less, and are skipped
+    floor = np.int64((least[0] - prior.most - prior.shape[0]) / s.model.nats) - 1
     n = 0
     for row in range(window[0], window[1]):
-        end = row * width + window[3]
-        for begin in range(row * width + window[2], end, BLOCK):
-            last = min(begin + BLOCK, end)
-            if not any_above(evidence, occupied, pattern, floor, begin, last):
+        first, end = row * width + window[2], row * width + window[3]
+        for block in range(first >> BLOCK_SHIFT, ((end - 1) >> BLOCK_SHIFT) + 1):
+            begin, last = max(block << BLOCK_SHIFT, first), min((block + 1) << BLOCK_SHIFT, end)
+            if not maps.touched[block] or not any_above(evidence, occupied, pattern, floor, begin, last):
                 continue
             for c in range(np.uint64(begin), np.uint64(last)):
                 if not seen[c]:
@@ -81,6 +76,10 @@ def promising(s: State, prior: Prior, least: Least, window: tuple[int, int, int,
                     cells[n] = c
                     gains[n] = gain
                     n += 1
+    # at the end, since a block may extend over several rows
+    for row in range(window[0], window[1]):
+        first, end = row * width + window[2], row * width + window[3]
+        maps.touched[first >> BLOCK_SHIFT : ((end - 1) >> BLOCK_SHIFT) + 1] = 0
     return n
 
 
@@ -99,6 +98,7 @@ def highest(s: State, cells: NDArray[np.int64], gains: Floats, workspace: Floats
             o = neighbour(cells[i], k, height, width)
             if o >= 0 and (workspace[o] > gains[i] or (workspace[o] == gains[i] and o < cells[i])):
                 chosen[i] = False
+                break
     for i in range(len(cells)):
         workspace[cells[i]] = 0.0
     return chosen

@@ -35,10 +35,13 @@ class Prior(NamedTuple):
         Of each cell alone; at most 0, except for occupied cells that must not change.
     shape : float64, shape (256,)
         Of each pattern of occupied neighbours; bit k stands for the neighbour k eighths of a turn from the x axis.
+    most : float
+        An upper bound of `local` for free cells.
     """
 
     local: Floats
     shape: Floats
+    most: float = 0.0
 
 
 def has_walls(parameters: SearchParameters) -> bool:
@@ -57,7 +60,7 @@ def independent_prior(parameters: SearchParameters, traversed: NDArray[np.bool_]
         Cells that the robot traversed.
     """
     odds = math.log(parameters.prior / (1 - parameters.prior))
-    return Prior(_local(odds, traversed), np.zeros(256))
+    return Prior(_local(odds, traversed), np.zeros(256), odds)
 
 
 def wall_prior(parameters: SearchParameters, traversed: NDArray[np.bool_], resolution: float) -> Prior:
@@ -74,7 +77,8 @@ def wall_prior(parameters: SearchParameters, traversed: NDArray[np.bool_], resol
     """
     if not has_walls(parameters):
         return independent_prior(parameters, traversed)
-    return Prior(_local(-parameters.wall_cost * resolution, traversed), shapes(parameters.end_cost))
+    odds = -parameters.wall_cost * resolution
+    return Prior(_local(odds, traversed), shapes(parameters.end_cost), odds)
 
 
 def _ends() -> Floats:
@@ -140,5 +144,6 @@ def odds_given_neighbours(prior: Prior, occupied: NDArray[np.bool_]) -> Floats:
 
 def log_prior(prior: Prior, occupied: NDArray[np.uint8], pattern: NDArray[np.uint8]) -> float:
     """Return the log prior of a map, up to a constant."""
-    cells = np.flatnonzero(occupied)
+    # numpy.flatnonzero is several times faster for bool
+    cells = np.flatnonzero(occupied.view(np.bool_))
     return float(prior.local[cells].sum() + prior.shape[pattern[cells]].sum())

@@ -125,7 +125,7 @@ class Search:
         self._prior = independent_prior(parameters, traversed)
         self._of_walls = wall_prior(parameters, traversed, evidence.grid.resolution)
         self._settled = np.zeros(evidence.grid.size, np.uint8)
-        self._tried_at = -1
+        self._begin_with(self._prior)
         # workspaces, since in a small map allocating them takes longer than most steps
         bottom, top, left, right = self._window
         cells = (top - bottom) * (right - left)
@@ -148,6 +148,13 @@ class Search:
         stay = np.where(self.evidence.state.maps.occupied == 1, FORBIDDEN, -FORBIDDEN)
         for prior in (self._prior, self._of_walls):
             np.copyto(prior.local, stay, where=~inside.ravel())
+
+    def _begin_with(self, prior: Prior) -> None:
+        """Use a prior, with which any flip and any shift may gain."""
+        self._prior = prior
+        self._settled[:] = 0
+        self._tried_at = -1
+        self.evidence.state.maps.touched[:] = 1
 
     def _advance(self, flips: int, shifts: int, gain: float, watch: Watch) -> None:
         check(self.evidence.state.stop)
@@ -173,12 +180,12 @@ class Search:
             If `stop` was set.
         """
         if self.evidence.state.maps.occupied.any():
-            independent, self._prior = self._prior, self._of_walls
+            independent = self._prior
+            self._begin_with(self._of_walls)
             converged = self._climb(watch)
             if converged and not self.progress.flips and not self.progress.shifts:
                 return self._result(converged)
-            self._prior = independent
-            self._settled[:] = 0
+            self._begin_with(independent)
         while self._more() and self._update_in_parallel(watch):
             pass
         return self.refine(watch)
@@ -187,14 +194,13 @@ class Search:
         """Search like `run`, but without the parallel updates at the beginning."""
         converged = self._climb(watch)
         if has_walls(self._parameters):
-            self._prior = self._of_walls
-            self._settled[:] = 0
+            self._begin_with(self._of_walls)
             converged = self._climb(watch)
         return self._result(converged)
 
     def improve(self, watch: Watch = lambda progress: None) -> SearchResult:
         """Continue from a map found by `run`, with the prior for walls only, until nothing gains."""
-        self._prior = self._of_walls
+        self._begin_with(self._of_walls)
         return self._result(self._climb(watch))
 
     def _result(self, converged: bool) -> SearchResult:
@@ -225,15 +231,18 @@ class Search:
         return cells[(left <= column) & (column < right)]
 
     def _promising(self) -> tuple[NDArray[np.int64], Floats]:
-        """Return the cells whose flip gains, the largest gain first, and the gains."""
+        """Return the cells whose flip gains, in the order of the map, and the gains; valid until the next call.
+
+        Only touched blocks are searched: when all cells listed before were tried in sequence, no others can gain.
+        """
         n = promising(self.evidence.state, self._prior, LEAST, self._window, self._gaining, self._gains)
-        cells, gains = self._gaining[:n], self._gains[:n]
-        order = np.argsort(-gains, kind='stable')
-        return cells[order], gains[order]
+        return self._gaining[:n], self._gains[:n]
 
     def _update_in_parallel(self, watch: Watch) -> bool:
         """Flip all cells that gain more than their neighbours; return whether another such update is worth while."""
         cells, gains = self._promising()
+        # a flip at once may touch all blocks, and cells that are not flipped may still gain
+        self.evidence.state.maps.touched[:] = 1
         cells = cells[highest(self.evidence.state, cells, gains, self._all_zero)]
         if len(cells) < FEW:
             return False
@@ -250,7 +259,9 @@ class Search:
         cells, gains = self._promising()
         if not len(cells):
             return 0
-        flips, gain = flip_in_order(self.evidence.state, self._prior, LEAST, cells, gains)
+        # the largest gain first
+        order = np.argsort(-gains, kind='stable')
+        flips, gain = flip_in_order(self.evidence.state, self._prior, LEAST, cells[order], gains[order])
         self._advance(flips, 0, gain, watch)
         return flips
 

@@ -175,7 +175,7 @@ def test_fewer_threads_are_used_if_memory_is_short(monkeypatch: pytest.MonkeyPat
     one.extend(readings)
     used: list[int] = []
     real = indexed_readings.run_each
-    monkeypatch.setattr(indexed_readings, 'run_each', lambda work: used.append(len(work)) or real(work))
+    monkeypatch.setattr(indexed_readings, 'run_each', lambda work, pool: used.append(len(work)) or real(work, pool))
     for limit in (10**9, 5 * 24 * GRID.size, 0):
         monkeypatch.setattr(indexed_readings, 'THREAD_MEMORY', limit)
         used.clear()

@@ -5,6 +5,8 @@ from __future__ import annotations
 import itertools
 import os
 import threading
+import time
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import numpy as np
@@ -85,23 +87,33 @@ def test_run_each_runs_work_in_parallel_and_waits() -> None:
         meeting.wait()
         done.append(k)
 
-    threads.run_each([lambda k=k: work(k) for k in range(3)])
+    with ThreadPoolExecutor(3) as pool:
+        threads.run_each([lambda k=k: work(k) for k in range(3)], pool)
     assert sorted(done) == [0, 1, 2]
 
 
 def test_single_work_runs_in_the_calling_thread() -> None:
     seen: list[int] = []
-    threads.run_each([lambda: seen.append(threading.get_ident())])
+    with ThreadPoolExecutor(1) as pool:
+        threads.run_each([lambda: seen.append(threading.get_ident())], pool)
     assert seen == [threading.get_ident()]
 
 
 @pytest.mark.parametrize('count', [1, 3])
-def test_error_of_a_thread_is_raised(count: int) -> None:
+def test_error_of_a_thread_is_raised_when_all_have_ended(count: int) -> None:
+    ended: list[int] = []
+
     def work() -> None:
         raise ValueError('of the work')
 
-    with pytest.raises(ValueError, match='of the work'):
-        threads.run_each([work] * count)
+    def later() -> None:
+        time.sleep(0.1)
+        ended.append(1)
+
+    with ThreadPoolExecutor(count) as pool:
+        with pytest.raises(ValueError, match='of the work'):
+            threads.run_each([work, *[later] * (count - 1)], pool)
+        assert len(ended) == count - 1
 
 
 def test_number_of_cores_is_at_least_one() -> None:

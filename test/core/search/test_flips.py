@@ -10,8 +10,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from move_cases import GRID, PRIORS, gain, height, neighbours, prior_of, random_case, seeds
 
+from forward_grid_mapper.core.common.grid import Grid
 from forward_grid_mapper.core.evidence.evidence import Evidence
 from forward_grid_mapper.core.evidence.fixed_point import QUANTUM
+from forward_grid_mapper.core.evidence.state import BLOCK_SHIFT
 from forward_grid_mapper.core.evidence.updates import flip
 from forward_grid_mapper.core.search.flips import (
     WORTH_WAITING,
@@ -23,6 +25,7 @@ from forward_grid_mapper.core.search.flips import (
 )
 from forward_grid_mapper.core.search.prior import Prior
 from forward_grid_mapper.core.search.search import LEAST
+from samples import plain_model, random_readings
 
 NOTHING = (0.0, 0.0)
 WHOLE = (0, GRID.height, 0, GRID.width)
@@ -32,6 +35,7 @@ def listed(
     evidence: Evidence, prior: Prior, least: tuple[float, float] = LEAST, window: tuple[int, int, int, int] = WHOLE
 ) -> tuple[np.ndarray, np.ndarray]:
     cells, gains = np.empty(GRID.size, np.int64), np.empty(GRID.size)
+    evidence.state.maps.touched[:] = 1
     n = promising(evidence.state, prior, least, window, cells, gains)
     return cells[:n], gains[:n]
 
@@ -67,6 +71,40 @@ def test_promising_cells_of_an_empty_map_are_found_at_any_threshold(seed: int, n
     maps.evidence[rng.random(GRID.size) < 0.9] = -(1 << 40)
     expected = [c for c in range(GRID.size) if maps.seen[c] and gain(evidence, prior, c) > least[0]]
     assert listed(evidence, prior, least)[0].tolist() == expected
+
+
+@pytest.mark.parametrize('seed', range(5))
+def test_flip_touches_the_blocks_of_all_cells_whose_gain_may_change(seed: int) -> None:
+    rng, area = np.random.default_rng(seed), Grid(0.1, 0, 0, 70, 50)
+    evidence = Evidence(area, plain_model(), start=rng.random(area.shape) < 0.1)
+    evidence.extend(random_readings(rng, area, 60, z_max=2.0))
+    maps, parts = evidence.state.maps, []
+    rows, columns = np.indices(area.shape)
+    for c in rng.choice(area.size, 30, replace=False):
+        before = maps.evidence.copy()
+        maps.touched[:] = 0
+        flip(evidence.state, int(c))
+        row, column = divmod(int(c), area.width)
+        # the prior of a cell depends on the patterns of its neighbours
+        near = (np.abs(rows - row) <= 2) & (np.abs(columns - column) <= 2)
+        assert maps.touched[np.flatnonzero((maps.evidence != before) | near.ravel()) >> BLOCK_SHIFT].all()
+        parts.append(maps.touched.mean())
+    assert 0 < min(parts) < max(parts) < 1
+
+
+def test_only_touched_blocks_of_the_window_are_searched_and_are_not_touched_then() -> None:
+    evidence, _ = random_case(0)
+    prior, maps = prior_of('none'), evidence.state.maps
+    every, _ = listed(evidence, prior)
+    assert {*(every >> BLOCK_SHIFT).tolist()} == {0, 1}
+    assert not maps.touched.any()
+    cells = np.empty(GRID.size, np.int64)
+    maps.touched[1] = 1
+    n = promising(evidence.state, prior, LEAST, WHOLE, cells, np.empty(GRID.size))
+    assert cells[:n].tolist() == every[every >> BLOCK_SHIFT == 1].tolist()
+    maps.touched[:] = 1
+    promising(evidence.state, prior, LEAST, (0, 2, 0, GRID.width), cells, np.empty(GRID.size))
+    assert maps.touched.tolist() == [0, 1]
 
 
 @pytest.mark.parametrize('seed', range(20))
