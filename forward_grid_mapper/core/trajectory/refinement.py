@@ -252,10 +252,12 @@ class Refiner:
         nodes = found.nodes
         if known is not None and gain_of_objective(scans, known, nodes).sigmas < LEAST_SIGMAS:
             return by_walls.refinement
-        better = gain_at_revisits(scans, windows.node, nodes)
         trajectory = refined(odometry, windows, nodes)
         moved, turned = differences(odometry, trajectory)
-        if better.sigmas < LEAST_SIGMAS or moved < least_moved:
+        if moved < least_moved:
+            return _without_better(by_walls.refinement)
+        better = gain_at_revisits(scans, windows.node, nodes)
+        if better.sigmas < LEAST_SIGMAS:
             return _without_better(by_walls.refinement)
         at_revisits = 'with recognised places, ' if has_revisits(scans, nodes) else ''
         by_name = dict.fromkeys(CALIBRATION, 0.0) | {

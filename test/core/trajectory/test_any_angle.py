@@ -10,6 +10,7 @@ from pentagon_drive import quietly
 
 from forward_grid_mapper.core.common.errors import InputError
 from forward_grid_mapper.core.trajectory import any_angle, scan_matching
+from forward_grid_mapper.core.trajectory import scans as scans_module
 from forward_grid_mapper.core.trajectory.holding_out import Gain
 from forward_grid_mapper.core.trajectory.odometry_model import CALIBRATION
 from forward_grid_mapper.core.trajectory.pose_graph import Solution, solution_at
@@ -48,6 +49,21 @@ class Trials:
         np.testing.assert_array_equal(self.calls[-1][0], relative(nodes[:-1], nodes[1:]))
         nodes[len(nodes) // 2 :, 0] += self._far
         return solution_at(nodes, 4), []
+
+
+def test_map_of_the_whole_drive_is_made_once_for_the_same_nodes(scans, monkeypatch) -> None:
+    nodes = scans.windows.node + np.array([0.5, 0.0, 0.0])
+    value, windows = scans.explained(nodes)
+    assert len(windows) == len(nodes)
+
+    def again(*rest) -> None:
+        raise AssertionError
+
+    monkeypatch.setattr(scans_module, 'explained', again)
+    assert scans.explained(nodes.copy())[1] is windows
+    assert scans.objective(nodes.copy()) == value
+    with pytest.raises(AssertionError):
+        scans.explained(nodes + 0.1)
 
 
 @pytest.mark.parametrize(
