@@ -6,7 +6,7 @@ import itertools
 import math
 import os
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor, wait
+from concurrent.futures import Future, ThreadPoolExecutor, wait
 from pathlib import Path
 
 from .control_groups import control_groups
@@ -49,12 +49,39 @@ def parts(begin: int, end: int, threads: int) -> list[tuple[int, int]]:
 def run_each(work: list[Callable[[], None]], pool: ThreadPoolExecutor) -> None:
     """Run each of `work` in a thread of the pool, and wait for all; raise the exception of the first one that failed.
 
-    The pool needs a thread for each. Single work runs in the calling thread.
+    The pool needs a thread for each. Single work runs in the calling thread, and so does work for which the system
+    starts no thread. No work runs any more when this returns or raises, not even after Ctrl-C: callers then restore the
+    state that it changes.
     """
     if len(work) == 1:
         work[0]()
         return
-    running = [pool.submit(job) for job in work]
-    wait(running)
-    for done in running:
-        done.result()
+    # not those of the pool: if it cannot start a thread, it keeps the work, and would run it at any later time
+    ends: list[Future[None]] = [Future() for _ in work]
+    try:
+        try:
+            for job, end in zip(work, ends, strict=True):
+                pool.submit(_run, job, end)
+        except (RuntimeError, MemoryError):
+            for job, end in zip(work, ends, strict=True):
+                if end.cancel():
+                    job()
+        wait([end for end in ends if not end.cancelled()])
+    finally:
+        wait([end for end in ends if not end.cancel()])
+    for end in ends:
+        if not end.cancelled():
+            end.result()
+
+
+def _run(job: Callable[[], None], end: Future[None]) -> None:
+    """Run a job unless its end is cancelled, and tell its end."""
+    if not end.set_running_or_notify_cancel():
+        return
+    try:
+        end.set_result(job())
+    except BaseException as error:
+        end.set_exception(error)
+    finally:
+        # the traceback of the exception refers to this frame: in a cycle, it would keep the evidence and its threads
+        del job, end

@@ -116,6 +116,53 @@ def test_error_of_a_thread_is_raised_when_all_have_ended(count: int) -> None:
         assert len(ended) == count - 1
 
 
+@pytest.mark.parametrize('most', [0, 1])
+def test_work_without_a_thread_runs_in_the_calling_thread_and_never_again(
+    monkeypatch: pytest.MonkeyPatch, most: int
+) -> None:
+    ran: list[int] = []
+    real = threading.Thread.start
+    started: list[threading.Thread] = []
+
+    def start(thread: threading.Thread) -> None:
+        if len(started) >= most:
+            raise RuntimeError("can't start new thread")
+        started.append(thread)
+        real(thread)
+
+    def work(k: int) -> None:
+        time.sleep(0.05)
+        ran.append(k)
+
+    with ThreadPoolExecutor(3) as pool:
+        with monkeypatch.context() as patch:
+            patch.setattr(threading.Thread, 'start', start)
+            threads.run_each([lambda k=k: work(k) for k in range(3)], pool)
+        assert sorted(ran) == [0, 1, 2]
+        threads.run_each([lambda k=k: work(k) for k in (3, 4)], pool)
+    assert sorted(ran) == [0, 1, 2, 3, 4]
+
+
+def test_no_work_runs_any_more_after_an_interruption(monkeypatch: pytest.MonkeyPatch) -> None:
+    begun, ended, real = threading.Barrier(3, timeout=120), [], threads.wait
+
+    def interrupted(ends: object) -> None:
+        monkeypatch.setattr(threads, 'wait', real)
+        begun.wait()
+        raise KeyboardInterrupt
+
+    def work() -> None:
+        begun.wait()
+        time.sleep(0.1)
+        ended.append(1)
+
+    monkeypatch.setattr(threads, 'wait', interrupted)
+    with ThreadPoolExecutor(2) as pool:
+        with pytest.raises(KeyboardInterrupt):
+            threads.run_each([work, work], pool)
+        assert len(ended) == 2
+
+
 def test_number_of_cores_is_at_least_one() -> None:
     assert threads.cores() >= 1
 
