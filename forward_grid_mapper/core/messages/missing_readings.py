@@ -5,7 +5,8 @@ then. This is no error either, but the map lacks the free space, most of all in 
 
 So the intervals between the stamps of a sensor are counted. A sensor whose readings are left out pauses again and again
 for many periods while others send, and no reading of any sensor is without an echo. Messages that get lost one by one
-make short pauses only.
+make short pauses only. Sensors that are triggered in turn, each after the echo of the one before, have longer intervals
+in a wide place than in a narrow one: by at most the time in which all wait for an echo from max_range.
 """
 
 from __future__ import annotations
@@ -30,6 +31,12 @@ MIDDLES = np.sqrt(EDGES[:-1].astype(np.float64) * EDGES[1:])
 
 PERIODS = 3.5
 """A pause is an interval of at least so many periods."""
+
+SLOWEST_SOUND = 300.0
+"""Metres per second, less than on the coldest day."""
+
+FARTHEST = 20.0
+"""Metres; no sonar waits for an echo from farther away, so a larger max_range is in another unit or not stated."""
 
 ENOUGH = 100
 """Fewest intervals of a sensor."""
@@ -90,11 +97,14 @@ class MissingReadings:
         self._of: dict[str, _Intervals] = {}
         self._together = _Intervals()
         self._count = self._silent = 0
+        self._farthest = 0.0
 
     def add(self, message: RangeMessage) -> None:
         """Take a message."""
         self._count += 1
         self._silent += not 0.0 < message.range < message.max_range
+        if self._farthest < message.max_range < FARTHEST:
+            self._farthest = message.max_range
         self._together.add(message.stamp)
         if own := self._intervals(message.frame_id):
             own.add(message.stamp)
@@ -104,6 +114,7 @@ class MissingReadings:
         echo = (messages.range > 0.0) & (messages.range < messages.max_range)
         self._count += len(echo)
         self._silent += len(echo) - int(np.count_nonzero(echo))
+        self._farthest = float(messages.max_range[messages.max_range < FARTHEST].max(initial=self._farthest))
         self._together.add_all(messages.stamp)
         for frame, part in messages.of_each():
             if own := self._intervals(frame):
@@ -120,9 +131,10 @@ class MissingReadings:
         if self._silent > NONE * self._count:
             return []
         missing = {}
+        waiting = len(self._of) * 2.0 * self._farthest / SLOWEST_SOUND * NANOSECONDS
         for frame, own in self._of.items():
             if own.counts.sum() >= ENOUGH:
-                pause = PERIODS * own.period
+                pause = max(PERIODS * own.period, own.period + waiting)
                 # while all sensors pause, the driver has stopped
                 missing[frame] = (own.longer(pause) - self._together.longer(pause)) / own.longer(0.0)
         found = sorted(frame for frame, part in missing.items() if part > MISSING)
@@ -133,5 +145,6 @@ class MissingReadings:
         return [
             f'sensors {names}{more} send nothing for up to {most:.0%} of the time while others send, and no reading is '
             'without an echo: does the driver leave out readings without an echo? It must send them with the range '
-            '+inf (REP 117), since they are the evidence for free space'
+            '+inf (REP 117), since they are the evidence for free space. Ignore this if the robot switches sensors off '
+            'for a time'
         ]

@@ -80,6 +80,24 @@ def test_sound_sensors_give_no_warning(name: str) -> None:
     assert warnings_of(sent(SOUND[name], rounds=2000)) == []
 
 
+@pytest.mark.parametrize('count', [4, 8])
+@pytest.mark.parametrize('pause', [1e6, 5e6, 20e6])
+@pytest.mark.parametrize('in_turn', [True, False])
+def test_sensors_that_wait_for_their_echo_give_no_warning(count: int, pause: float, in_turn: bool) -> None:
+    rng, messages = random.Random(3), []
+    stamps = [0.0] * count
+    for k in range(12_000):
+        # of those that do not wait for each other, the one whose turn is first
+        n = k % count if in_turn else stamps.index(min(stamps))
+        stamp = max(stamps) if in_turn else stamps[n]
+        # from a narrow place to a wide one and back, as fast as a robot drives
+        value = rng.uniform(0.9, 1.1) * (0.3 if stamp // 8e9 % 2 else 4.5)
+        stamps[n] = stamp + pause + 2 * value / 340 * 1e9
+        messages.append(RangeMessage(int(stamps[n]), SENSORS[n], value, 0.02, 5.0, 0.3))
+    messages.sort(key=lambda message: message.stamp)
+    assert warnings_of(messages) == []
+
+
 @settings(max_examples=50, deadline=None)
 @given(seed=st.integers(0, 2**32), sizes=st.lists(st.integers(0, 40), max_size=5))
 def test_batch_counts_as_single_messages(seed: int, sizes: list[int]) -> None:
@@ -91,11 +109,13 @@ def test_batch_counts_as_single_messages(seed: int, sizes: list[int]) -> None:
         for _ in range(size):
             stamp += rng.choice(steps)
             value = rng.choice([-1.0, 0.0, 1.0, 5.0, math.inf, math.nan])
-            messages.append(RangeMessage(stamp, rng.choice(['a', 'b', '', 'c\n']), value, 0.1, 5.0, 0.3))
+            limit = rng.choice([3.0, 5.0, 500.0, math.inf, math.nan])
+            messages.append(RangeMessage(stamp, rng.choice(['a', 'b', '', 'c\n']), value, 0.1, limit, 0.3))
         for message in messages:
             one.add(message)
         many.add_all(batch_of(list(enumerate(messages))).ranges)
     assert (one._count, one._silent, one._of.keys()) == (many._count, many._silent, many._of.keys())
+    assert one._farthest == many._farthest
     assert not one._of.keys() & {'', 'c\n'}
     for first, second in [(one._together, many._together), *((one._of[name], many._of[name]) for name in one._of)]:
         assert first._last == second._last
