@@ -130,18 +130,23 @@ def of_sections(arguments: Sequence[str], node: str) -> list[str]:
         except (OSError, ValueError, RecursionError, yaml.YAMLError):
             # ROS has accepted it
             continue
-        if names and not any(re.fullmatch(_pattern(name), node) for name in names):
+        if names and not any(_applies(name, node) for name in names):
             more = f' and {len(names) - 3} more' if len(names) > 3 else ''
             found.append(
                 f'--params-file {file} is ignored: it has parameters of {", ".join(names[:3])}{more}, but this node is '
-                f'{node}; what is meant for this node belongs into a section /** or {node}'
+                f'{node}; put the parameters of this node into a section /** or {node}'
             )
     return found
 
 
-def _pattern(section: str) -> str:
-    """Return the pattern of the nodes to which rclpy gives the parameters of a section."""
-    return re.escape(section).replace(r'/\*', r'(/\w+)').replace(r'\*', '*')
+def _applies(section: str, node: str) -> bool:
+    """Return whether rclpy gives the parameters of a section to a node."""
+    pattern = re.escape(section).replace(r'/\*', r'(/\w+)').replace(r'\*', '*')
+    try:
+        return re.fullmatch(pattern, node) is not None
+    except re.error:
+        # of a name such as my**
+        return False
 
 
 def _sections(document: Any, prefix: str) -> Iterator[str]:

@@ -154,6 +154,7 @@ def test_error_in_a_parameter_file_has_a_remedy(tmp_path: Path, text: str, why: 
         ('robot2: {forward_grid_mapper: {ros__parameters: {p_hit: 0.5}}}', '/robot2/forward_grid_mapper'),
         ('\n'.join(f'{name}: {{ros__parameters: {{}}}}' for name in 'abcd'), 'of /a, /b, /c and 1 more'),
         ('/*: {ros__parameters: {p_hit: 0.5}}', '/*'),
+        ('my**: {ros__parameters: {p_hit: 0.5}}', '/my**'),
         ('/robot1/forward_grid_mapper: {ros__parameters: !!python/tuple {p_hit: 0.5}}', ''),
         ('robot1: {forward_grid_mapper: {ros__parameters: {p_hit: 0.5}}}\namcl: {ros__parameters: {x: 1}}', ''),
         ('/**: {ros__parameters: {p_hit: 0.5}}', ''),

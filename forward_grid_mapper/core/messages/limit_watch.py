@@ -162,8 +162,8 @@ def _below(samples: Floats, many: float) -> str:
     if count < many * len(ranges):
         return ''
     limit = _middle(least)
-    # a sonar's blind zone is a few centimetres, and its limits have one unit
-    if limit < 1.0 and _middle((least / ranges)[below]) < 2.0:
+    # a sonar's blind zone is a few centimetres, and its limits have one unit; a single sensor may be covered by dirt
+    if limit < 1.0 and (many == MANY_OF_ONE or _middle((least / ranges)[below]) < 2.0):
         return ''
     return (
         f'{count} of {len(ranges)} examined ranges are below min_range ({limit:g} m), and so are rejected: are '

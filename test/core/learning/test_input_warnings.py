@@ -399,6 +399,15 @@ def test_sensor_that_sees_the_robot_gives_no_warning_of_no_echo() -> None:
     assert not [text for text in warnings_of(near) if 'if there is no echo' in text]
 
 
+def test_sensor_that_is_covered_at_times_gives_no_warning_of_units() -> None:
+    """It sees the dirt on it, nearer than min_range."""
+    rng, frame = np.random.default_rng(0), next(iter(circling().extrinsics))
+    covered = circling().with_ranges(
+        lambda m: m._replace(range=0.04) if m.frame_id == frame and rng.random() < 0.4 else m
+    )
+    assert not [text for text in warnings_of(covered) if 'must state metres' in text]
+
+
 def test_plausible_variance_gives_no_warning() -> None:
     assert warnings_of(drive().with_ranges(lambda m: m._replace(variance=0.04))) == []
 
