@@ -58,10 +58,11 @@ def run_each(work: list[Callable[[], None]], pool: ThreadPoolExecutor) -> None:
         return
     # not those of the pool: if it cannot start a thread, it keeps the work, and would run it at any later time
     ends: list[Future[None]] = [Future() for _ in work]
+    errors: dict[int, BaseException] = {}
     try:
         try:
-            for job, end in zip(work, ends, strict=True):
-                pool.submit(_run, job, end)
+            for k, job in enumerate(work):
+                pool.submit(_run, job, ends[k], k, errors)
         except (RuntimeError, MemoryError):
             for job, end in zip(work, ends, strict=True):
                 if end.cancel():
@@ -69,19 +70,22 @@ def run_each(work: list[Callable[[], None]], pool: ThreadPoolExecutor) -> None:
         wait([end for end in ends if not end.cancelled()])
     finally:
         wait([end for end in ends if not end.cancel()])
-    for end in ends:
-        if not end.cancelled():
-            end.result()
+    first = errors[min(errors)] if errors else None
+    # tracebacks refer to the work: in a cycle, they would keep the evidence and its threads
+    errors.clear()
+    try:
+        if first is not None:
+            raise first
+    finally:
+        del first
 
 
-def _run(job: Callable[[], None], end: Future[None]) -> None:
-    """Run a job unless its end is cancelled, and tell its end."""
+def _run(job: Callable[[], None], end: Future[None], k: int, errors: dict[int, BaseException]) -> None:
+    """Run job k unless its end is cancelled; note its error, and tell its end."""
     if not end.set_running_or_notify_cancel():
         return
     try:
-        end.set_result(job())
+        job()
     except BaseException as error:
-        end.set_exception(error)
-    finally:
-        # the traceback of the exception refers to this frame: in a cycle, it would keep the evidence and its threads
-        del job, end
+        errors[k] = error
+    end.set_result(None)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import contextlib
+import gc
 import itertools
 import os
 import threading
@@ -161,6 +163,32 @@ def test_no_work_runs_any_more_after_an_interruption(monkeypatch: pytest.MonkeyP
         with pytest.raises(KeyboardInterrupt):
             threads.run_each([work, work], pool)
         assert len(ended) == 2
+
+
+@pytest.mark.parametrize('fails', [False, True])
+def test_threads_end_with_the_owner_of_the_pool(fails: bool) -> None:
+    """Without the garbage collector, which may come much later: one run makes many pools."""
+    begun: list[threading.Thread] = []
+
+    def work(pool: ThreadPoolExecutor) -> None:
+        begun.append(threading.current_thread())
+        time.sleep(0.05)
+        if fails:
+            raise ValueError
+
+    def run() -> None:
+        pool = ThreadPoolExecutor(3)
+        with contextlib.suppress(ValueError):
+            threads.run_each([lambda: work(pool)] * 3, pool)
+
+    gc.disable()
+    try:
+        run()
+        for thread in begun:
+            thread.join(60.0)
+    finally:
+        gc.enable()
+    assert len(begun) == 3 and not any(thread.is_alive() for thread in begun)
 
 
 def test_number_of_cores_is_at_least_one() -> None:
