@@ -121,28 +121,31 @@ class LimitWatch:
         """Return warnings; empty if there is no suspicion."""
         if not self._of:
             return []
-        if of_all := _suspicion(np.concatenate([samples.values for samples in self._of.values()]), MANY):
+        if of_all := _suspicion(np.concatenate([samples.values for samples in self._of.values()])):
             return [of_all]
-        found = {frame: _suspicion(samples.values, MANY_OF_ONE) for frame, samples in sorted(self._of.items())}
+        found = {frame: _suspicion(samples.values, alone=True) for frame, samples in sorted(self._of.items())}
         return [f'sensor {frame}: {suspicion}' for frame, suspicion in found.items() if suspicion]
 
 
-def _suspicion(values: Floats, many: float) -> str:
-    """Return what is wrong with ranges and limits, shape (N, 3), in words; '' if there is no suspicion."""
+def _suspicion(values: Floats, alone: bool = False) -> str:
+    """Return what is wrong with ranges and limits, shape (N, 3), in words; '' if there is no suspicion.
+
+    `alone` is true for those of a single sensor.
+    """
     ranges, _, limits = samples = values.T
     finite = samples[:, np.isfinite(ranges) & (ranges > 0) & (limits > 0) & (limits < np.inf)]
     if finite.shape[1] < ENOUGH:
         return ''
     # one cause has several symptoms; the first that is reported is enough
-    return _beyond(finite, many) or _far(finite) or _below(finite, many)
+    return _beyond(finite, alone) or _far(finite) or _below(finite, alone)
 
 
-def _beyond(samples: Floats, many: float) -> str:
+def _beyond(samples: Floats, alone: bool) -> str:
     ranges, _, limits = samples
     beyond = ranges > BEYOND * limits
     counts = np.unique(ranges[beyond], return_counts=True)[1]
     count = int(counts.sum())
-    if count < many * len(ranges) or counts.max() > SENTINEL * count:
+    if count < (MANY_OF_ONE if alone else MANY) * len(ranges) or counts.max() > SENTINEL * count:
         return ''
     # no echo comes from beyond max_range, whatever its unit
     ratio = _at(0.98, (ranges / limits)[beyond])
@@ -154,16 +157,16 @@ def _beyond(samples: Floats, many: float) -> str:
     )
 
 
-def _below(samples: Floats, many: float) -> str:
+def _below(samples: Floats, alone: bool) -> str:
     ranges, least, limits = samples
     # limits that contradict each other are rejected for that
     below = (ranges < least) & (least < limits)
     count = int(below.sum())
-    if count < many * len(ranges):
+    if count < (MANY_OF_ONE if alone else MANY) * len(ranges):
         return ''
     limit = _middle(least)
     # a sonar's blind zone is a few centimetres, and its limits have one unit; a single sensor may be covered by dirt
-    if limit < 1.0 and (many == MANY_OF_ONE or _middle((least / ranges)[below]) < 2.0):
+    if limit < 1.0 and (alone or _middle((least / ranges)[below]) < 2.0):
         return ''
     return (
         f'{count} of {len(ranges)} examined ranges are below min_range ({limit:g} m), and so are rejected: are '
