@@ -14,7 +14,7 @@ from .console import run
 
 COMMAND = 'warm_up'
 DESCRIPTION = """Compile every kernel and keep the machine code on disk, where the node and the other commands find it:
-half a minute to two minutes the first time, some seconds if they are there. Run it once after an installation, as
+one to three minutes the first time, two seconds if they are there. Run it once after an installation, as
 the user who will run the node, or with NUMBA_CACHE_DIR set to a folder that this user can write."""
 
 

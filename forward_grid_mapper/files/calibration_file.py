@@ -67,7 +67,7 @@ def load_calibration(path: Path | str) -> dict[str, float]:
         document = yaml.safe_load(read_text(path, ParameterError))
     except OSError as error:
         raise ParameterError(f'{path} cannot be read: {error.strerror}') from error
-    except (UnicodeDecodeError, yaml.YAMLError, RecursionError, ValueError) as error:
+    except (yaml.YAMLError, RecursionError, ValueError) as error:
         raise ParameterError(f'{path} is not valid YAML: {error}') from error
     if not isinstance(document, dict) or not document:
         raise ParameterError(f'{path} contains no calibration, such as "travel_factor: 1.012"')

@@ -65,8 +65,6 @@ def load_parameters(path: Path | str) -> ParameterFile:
         text = read_text(path, ParameterError)
     except OSError as error:
         raise ParameterError(f'{path} cannot be read: {error.strerror}') from error
-    except UnicodeDecodeError as error:
-        raise ParameterError(f'{path} is not valid YAML: {error}') from error
     try:
         document = yaml.load(text, _Loader)
         flat: dict[str, Any] = {}

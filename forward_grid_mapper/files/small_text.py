@@ -16,14 +16,15 @@ def read_text(path: Path, error: type[MapperError]) -> str:
     Raises
     ------
     error
-        Naming the file, if it is larger than `MOST`.
+        Naming the file, if it is larger than `MOST`, or not UTF-8.
     OSError
         If it cannot be read.
-    UnicodeDecodeError
-        If it is not UTF-8.
     """
     with path.open('rb') as file:
         content = file.read(MOST + 1)
     if len(content) > MOST:
         raise error(f'{path} has more than {MOST:,} bytes; it is not a file of this kind')
-    return content.decode('utf-8')
+    try:
+        return content.decode('utf-8')
+    except UnicodeDecodeError as reason:
+        raise error(f'{path} is not text in UTF-8, from byte {reason.start} on; save it in this encoding') from reason

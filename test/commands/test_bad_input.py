@@ -537,7 +537,7 @@ def test_path_that_is_no_parameter_file_is_rejected(
     for path, expected in (
         (tmp_path / 'absent.yaml', 'cannot be read: No such file'),
         (tmp_path, 'cannot be read: Is a directory'),
-        (picture, 'not valid YAML'),
+        (picture, 'not text in UTF-8'),
     ):
         error = error_of(capsys, tmp_path, plain / 'bag', '-o', tmp_path / 'maps', '--params', path)
         assert str(path) in error and expected in error

@@ -191,9 +191,10 @@ def test_bad_parameter_file_is_rejected_with_reason(tmp_path: Path, text: str, m
 def test_unreadable_parameter_file_is_rejected(tmp_path: Path) -> None:
     with pytest.raises(ParameterError, match='cannot be read'):
         load_parameters(tmp_path / 'absent.yaml')
-    (tmp_path / 'binary').write_bytes(b'\xff\xfe\x00\x81')
-    with pytest.raises(ParameterError, match='not valid YAML'):
-        load_parameters(tmp_path / 'binary')
+    for content in (b'\xff\xfe\x00\x81', 'p_hit: 0.5  # Größe'.encode('latin-1')):
+        (tmp_path / 'binary').write_bytes(content)
+        with pytest.raises(ParameterError, match=r'binary is not text in UTF-8, from byte \d+ on; save it in this'):
+            load_parameters(tmp_path / 'binary')
 
 
 @settings(deadline=None)
