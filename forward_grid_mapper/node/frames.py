@@ -9,7 +9,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from ..core.messages.extrinsics import LATE, LATER, Later, mount_of
-from ..core.messages.message_types import NANOSECONDS, OdometryMessage, Pose2, planar_pose
+from ..core.messages.message_types import NANOSECONDS, OdometryMessage, Pose2, planar_pose, stamp_of
 from ..core.messages.quaternions import rotation_of
 from ..core.messages.stamp_order import GOES_ON, JUMP, JUMPED_BACK, StampOrder
 
@@ -121,6 +121,21 @@ class Transforms:
             return LATER
         self._missing.pop(key, None)
         return found.transform
+
+    def latest(self, target: str, source: str) -> int | None:
+        """Return the stamp of the newest transform of `source` in `target`, nanoseconds; None if there is none.
+
+        It is 0 if a transform between them was ever static.
+        """
+        if self._buffer is None:
+            return None
+        from rclpy.time import Time
+
+        try:
+            found = self._buffer.lookup_transform(target, source, Time())
+        except self._error:
+            return None
+        return stamp_of(found.header)
 
 
 class Extrinsics:

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 import time
+from collections import deque
 from collections.abc import Callable
 from typing import Any
 
@@ -17,7 +18,7 @@ from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped, TransformS
 from nav_msgs.msg import Path
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 
-from ..core.messages.message_types import NANOSECONDS, Pose2
+from ..core.messages.message_types import NANOSECONDS, Pose2, stamp_of
 from ..core.messages.stamp_order import JUMP
 from ..core.trajectory.poses import Floats
 from ..core.trajectory.windows import Odometry
@@ -27,6 +28,9 @@ PERIOD = 0.05
 
 REPEAT = 1.0
 """Seconds after which the transform is repeated if nothing is new."""
+
+REMEMBERED = 2000
+"""Most stamps of transforms sent that are remembered: those of 100 s."""
 
 TOLERANCE = NANOSECONDS // 5
 """Nanoseconds from odometry's stamp to the stamp of the transform."""
@@ -72,6 +76,7 @@ class PosePublishers:
         self._pose = None if self._send else node.create_publisher(PoseWithCovarianceStamped, '~/pose', 10)
         self._path = node.create_publisher(Path, '~/path', LATCHED)
         self._sent: tuple[int, tuple[float, ...]] = (-1, ())
+        self._stamps = deque[int](maxlen=REMEMBERED)
         self._due = 0.0
 
     @property
@@ -109,6 +114,7 @@ class PosePublishers:
             transform = TransformStamped(child_frame_id=odom_frame)
             transform.header.frame_id = map_frame
             _set_stamp(transform.header.stamp, stamp + TOLERANCE)
+            self._stamps.append(stamp_of(transform.header))
             transform.transform.translation.x, transform.transform.translation.y = x, y
             _set_yaw(transform.transform.rotation, yaw)
             self._send(transform)
@@ -120,6 +126,10 @@ class PosePublishers:
             message.pose.pose.position.x, message.pose.pose.position.y = there.x, there.y
             _set_yaw(message.pose.pose.orientation, there.yaw)
             self._pose.publish(message)
+
+    def sent_at(self, stamp: int) -> bool:
+        """Return whether a transform with this stamp, nanoseconds, was sent on TF lately."""
+        return stamp in self._stamps
 
     def forget(self) -> None:
         """Send the next transform with any stamp, since the clock jumped or a new drive begins."""

@@ -48,7 +48,11 @@ class Reporter:
         self._live, self._em, self._journal, self._trajectory = live, em, journal, trajectory
         self._kernels, self._workers = kernels, list(workers)
         self._surroundings = Surroundings(
-            node, intake.subscriptions, transforms.topics, lambda: bool(associator.unknown_frames)
+            node,
+            intake.subscriptions,
+            transforms.topics,
+            lambda: bool(associator.unknown_frames),
+            lambda: trajectory.contested(transforms.latest),
         )
         self._verdicts = VerdictLog(node.get_logger())
         self._reported: set[str] = set()

@@ -1,4 +1,4 @@
-"""Faults in the ROS graph: publishers with incompatible QoS, no clock, nodes with the same name."""
+"""Faults in the ROS graph: incompatible QoS, no clock, nodes with the same name, two publishers of a transform."""
 
 from __future__ import annotations
 
@@ -27,6 +27,7 @@ class Surroundings:
         subscriptions: dict[str, QoSProfile],
         transforms: tuple[str, ...] = (),
         frames_missing: Callable[[], bool] = lambda: False,
+        contested: Callable[[], str] = str,
     ) -> None:
         """Prepare to check.
 
@@ -39,9 +40,11 @@ class Surroundings:
             The topics of TF and of static TF; empty if the node does not subscribe to TF.
         frames_missing : callable
             Returns whether a sensor has no pose.
+        contested : callable
+            Returns the fault of another publisher of a transform that this node publishes, or ''.
         """
         self._node, self._subscriptions = node, subscriptions
-        self._transforms, self._frames_missing = transforms, frames_missing
+        self._transforms, self._frames_missing, self._contested = transforms, frames_missing, contested
         self._reported: set[str] = set()
         self._next = 0.0
         self._begin = time.monotonic()
@@ -53,6 +56,7 @@ class Surroundings:
         if now >= self._next:
             self._next = now + PERIOD
             self._faults = [*self._incompatible(), *self._transforms_lost(), *self._no_clock(), *self._same_names()]
+            self._faults += filter(None, [self._contested()])
             for fault in self._faults:
                 if fault not in self._reported and len(self._reported) < 100:
                     self._reported.add(fault)

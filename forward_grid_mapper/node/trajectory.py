@@ -263,6 +263,23 @@ class Trajectory:
         level = DiagnosticStatus.WARN if troubled else DiagnosticStatus.OK
         return [status(f'{name}: trajectory', level, message, name, values)]
 
+    def contested(self, latest: Callable[[str, str], int | None]) -> str:
+        """Return the fault of another publisher of the transform from map to odometry, in words, or ''.
+
+        `latest` returns the stamp of the newest transform on TF, given the target and the source frame, or None.
+        """
+        if self._out is None or not self.on or self.obstacle or not self.listening():
+            return ''
+        frames = self.frame.lstrip('/'), self._associator.map_frame.lstrip('/')
+        stamp = latest(*frames) if all(frames) else None
+        if stamp is None or self._out.sent_at(stamp):
+            return ''
+        return (
+            f'another node publishes the transform from {frames[0]} to {frames[1]} as well, so the pose of the robot '
+            'jumps between both: stop it (a static_transform_publisher, AMCL, another SLAM node, or a bag with this '
+            'transform) and start all nodes anew, or set refine_poses to false'
+        )
+
     def _transform(self) -> str:
         """Return where the transform from map to odometry is published, in words."""
         if self._out is None or not self.on or self.obstacle:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import math
 import sys
 from collections.abc import Callable
@@ -14,6 +15,7 @@ import pytest
 pytest.importorskip('rclpy', reason='the tests of the node need rclpy')
 
 from drift_samples import bend
+from geometry_msgs.msg import TransformStamped
 from inside import Inside
 from refined_robot import odometry_of
 from sensor_msgs.msg import MultiDOFJointState
@@ -21,7 +23,7 @@ from sensor_msgs.msg import MultiDOFJointState
 from forward_grid_mapper.core.messages.message_types import NANOSECONDS, Pose2
 from forward_grid_mapper.core.trajectory.poses import compose
 from forward_grid_mapper.core.trajectory.windows import Odometry
-from forward_grid_mapper.node import pose_publishers, trajectory
+from forward_grid_mapper.node import pose_publishers, surroundings, trajectory
 from forward_grid_mapper.node.pose_publishers import REPEAT
 
 OK, WARN = b'\x00', b'\x01'
@@ -31,9 +33,11 @@ class Broadcaster:
     """Stand-in for `tf2_ros.TransformBroadcaster`."""
 
     sent: list[Any]
+    newest: Any
+    """The newest transform from map to odom in all buffers; None without one."""
 
     def __init__(self, node: Any, qos: Any = None) -> None:
-        type(self).sent = []
+        type(self).sent, type(self).newest = [], None
 
     def sendTransform(self, transform: Any) -> None:  # noqa: N802
         self.sent.append(transform)
@@ -48,7 +52,7 @@ def stand_in(monkeypatch: pytest.MonkeyPatch, module: str, **names: Any) -> None
 
 @pytest.fixture
 def tf2_ros(monkeypatch: pytest.MonkeyPatch) -> type[Broadcaster]:
-    """Stand-in for the parts of tf2_ros that the node uses; its buffer has no transforms."""
+    """Stand-in for the parts of tf2_ros that the node uses; its buffer has no transforms but `Broadcaster.newest`."""
 
     class Buffer:
         def __init__(self, cache_time: Any = None, node: Any = None) -> None:
@@ -58,7 +62,9 @@ def tf2_ros(monkeypatch: pytest.MonkeyPatch) -> type[Broadcaster]:
             pass
 
         def lookup_transform(self, target: str, source: str, time: Any, timeout: Any = None) -> Any:
-            raise Unknown(source)
+            if Broadcaster.newest is None or (target, source) != ('map', 'odom') or time.nanoseconds:
+                raise Unknown(source)
+            return Broadcaster.newest
 
     class Unknown(Exception):
         pass
@@ -155,6 +161,39 @@ def test_transform_is_repeated_without_new_odometry(
     robot.odometry(100.1)
     tick()
     assert seconds_of(sent[-1]) == pytest.approx(100.3) and len(sent) == 5
+
+
+def test_other_publisher_of_the_transform_is_a_fault(
+    inside: Callable[..., Inside], tf2_ros: type[Broadcaster], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(surroundings, 'PERIOD', 0.0)
+    robot, _ = mapping(inside, monkeypatch)
+    fault = 'another node publishes the transform from map to odom as well'
+    robot.drive(0, 40)
+    for seconds in (100.0, 101.0, 101.0):
+        robot.odometry(seconds)
+        robot.node.trajectory._tick()
+        for newest in (None, tf2_ros.sent[-1]):
+            tf2_ros.newest = newest
+            assert fault not in robot.status('readings')['message']
+    for other in (0, 101_700_000_000):
+        tf2_ros.newest = copy.deepcopy(tf2_ros.sent[-1])
+        tf2_ros.newest.header.stamp.sec, tf2_ros.newest.header.stamp.nanosec = divmod(other, NANOSECONDS)
+        assert fault in robot.status('readings')['message']
+    assert robot.status('readings')['level'] == WARN
+    # an inactive node leaves the transform to others
+    robot.node.deactivate()
+    assert fault not in robot.status('readings')['message']
+
+
+def test_other_publisher_is_no_fault_without_refinement(
+    inside: Callable[..., Inside], tf2_ros: type[Broadcaster], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(surroundings, 'PERIOD', 0.0)
+    robot = inside().start()
+    robot.drive(0, 40)
+    tf2_ros.newest = TransformStamped()
+    assert 'another node' not in robot.status('readings')['message']
 
 
 def test_one_stamp_from_the_future_is_not_published_to_tf(
