@@ -21,9 +21,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..common.parameters import Parameters
-from ..common.readings import Readings, of_drives
+from ..common.readings import Floats, Readings, of_drives
 from .holding_out import LEAST_SIGMAS, Gain, gain
-from .poses import Floats, compose, inverse, relative, wrapped
+from .poses import compose, inverse, relative, wrapped
 from .registration import SILENT, OnMap, moved_to, readings_moved
 from .windows import Odometry
 

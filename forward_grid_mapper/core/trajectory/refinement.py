@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from ..common.errors import InputError
 from ..common.parameters import Parameters
-from ..common.readings import Readings
+from ..common.readings import Floats, Readings
 from ..runtime.cancelling import check
 from .any_angle import match_drive
 from .certainty import LARGEST_SIGMA, yaw_errors
@@ -33,7 +33,7 @@ from .jumps import MOST_JUMPS, Part, begins_of, jumps, parts_at, with_doubtful, 
 from .local_map import for_matching
 from .odometry_model import CALIBRATION
 from .outcome import Refinement, differences, joined_parts, replaced, with_all_poses, with_outliers
-from .poses import Floats, compose, inverse
+from .poses import compose, inverse
 from .relocating import LEAST_RECOGNISED, recognised_part
 from .scans import Scans
 from .solving import Solver

@@ -11,6 +11,7 @@ from pentagon_drive import quietly
 
 from forward_grid_mapper.core.common.errors import Cancelled
 from forward_grid_mapper.core.common.parameters import Parameters
+from forward_grid_mapper.core.common.readings import Floats
 from forward_grid_mapper.core.mapping import Mapper
 from forward_grid_mapper.core.trajectory import any_angle, refinement, scan_matching
 from forward_grid_mapper.core.trajectory.any_angle import MatchedDrive
@@ -19,7 +20,7 @@ from forward_grid_mapper.core.trajectory.judging import gain_of_objective, gain_
 from forward_grid_mapper.core.trajectory.likelihood import scores
 from forward_grid_mapper.core.trajectory.local_map import for_matching
 from forward_grid_mapper.core.trajectory.outcome import Refinement
-from forward_grid_mapper.core.trajectory.poses import Floats, compose, relative, rms_after_alignment
+from forward_grid_mapper.core.trajectory.poses import compose, relative, rms_after_alignment
 from forward_grid_mapper.core.trajectory.refinement import Refiner, _Attempt, _Drive
 from forward_grid_mapper.core.trajectory.relocating import LEAST_RECOGNISED
 from forward_grid_mapper.core.trajectory.scan_matching import BLOCK, FIRST, TRUSTS, scan_matched
