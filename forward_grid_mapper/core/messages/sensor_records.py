@@ -1,8 +1,8 @@
 """Records of sensors by frame: which sensors get one, where messages are watched for the faults of each sensor.
 
 Messages name their frame themselves, so a faulty driver, or anyone in the network, can send new names without end. So
-only the sensors that are heard first have records, at most `MOST_FRAMES`, and none has one whose name no frame can have:
-warnings and diagnostics show the names. Readings of sensors beyond the bound are mapped too, but are not watched.
+only the sensors that are heard first have records, at most `MOST_FRAMES`. None is for a name that no frame can have,
+since warnings and diagnostics show the names. Readings of sensors beyond the bound are mapped too, but not watched.
 """
 
 from __future__ import annotations
