@@ -39,7 +39,7 @@ from .odometry_model import CALIBRATION, Noise, calibrated, covariances, motions
 from .passes import BEHIND, BLOCK
 from .pose_graph import Edges, Graph, Yaws, joined, no_edges, no_walls, solve
 from .poses import compose, relative
-from .refinement import SHORTEST
+from .refinable import SHORTEST
 from .scans import FEWEST_ON_MAP, Scans
 from .solving import LEAST_YAW, NOISE_FACTOR
 from .tail import Tail, continued, edges_from, from_step, window_coordinate
