@@ -7,6 +7,8 @@ from collections.abc import Callable, Collection, Iterator
 from functools import partial
 from typing import Any, NamedTuple, Protocol
 
+from ..core.common.words import counted
+
 RawMessage = tuple[int, int, bytes]
 """Channel key, log time in nanoseconds, serialized message."""
 
@@ -126,7 +128,7 @@ class RosbagsSource:
             self.damage = one_line(error)
         expected = sum(c.msgcount for c in connections)
         if self.damage is None and seen < expected:
-            self.damage = f'the index promises {expected} messages, only {seen} were found'
+            self.damage = f'the index promises {counted(expected, "message")}, only {seen} were found'
         if self.damage is not None and self._scan is not None:
             yield from self._rest(keys, last, Counter(at_last))
 
