@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Collection, Iterator
+from collections.abc import Callable, Collection, Iterable, Iterator
+from contextlib import ExitStack
 from functools import partial
 from typing import Any, NamedTuple, Protocol
 
@@ -50,6 +51,13 @@ class Source(Protocol):
 
     def close(self) -> None:
         """Release the file."""
+
+
+def close_all(sources: Iterable[Source]) -> None:
+    """Close sources, also the others if one cannot be closed: some have a temporary folder with gigabytes."""
+    with ExitStack() as closing:
+        for source in sources:
+            closing.callback(source.close)
 
 
 def one_line(error: BaseException) -> str:
