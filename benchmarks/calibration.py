@@ -23,13 +23,12 @@ from quality_worlds import Case, scoring_tool, simulated_cases
 from scipy.optimize import minimize
 
 from forward_grid_mapper.core.common.parameters import Parameters
+from forward_grid_mapper.core.common.readings import Floats
 from forward_grid_mapper.core.evidence.evidence import Evidence
 from forward_grid_mapper.core.evidence.neighbourhood import patterns
 from forward_grid_mapper.core.mapping import Mapper
 from forward_grid_mapper.core.maps import uncertainty as weighting
 from forward_grid_mapper.core.maps.free_space import expected_passes
-
-Floats = NDArray[np.float64]
 
 NAMES = ('HOLE', 'INSIDE', 'STEP', 'END', 'BESIDE', 'ALONE', 'OCCUPIED', 'LEAST_AROUND', 'MEAN_AROUND')
 CLIP = 0.02

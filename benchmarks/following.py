@@ -19,11 +19,11 @@ import numpy as np
 from trajectories import LEVELS, ROBOTS, odometry_of, worlds
 
 from forward_grid_mapper.core.common.parameters import Parameters
-from forward_grid_mapper.core.common.readings import Readings
+from forward_grid_mapper.core.common.readings import Floats, Readings
 from forward_grid_mapper.core.trajectory.correction import Correction
 from forward_grid_mapper.core.trajectory.following import Follower
 from forward_grid_mapper.core.trajectory.outcome import Refinement
-from forward_grid_mapper.core.trajectory.poses import Floats, compose, inverse
+from forward_grid_mapper.core.trajectory.poses import compose, inverse
 from forward_grid_mapper.core.trajectory.refinement import Refiner
 from forward_grid_mapper.core.trajectory.windows import Odometry
 from forward_grid_mapper.core.warm_up import warm_up

@@ -20,11 +20,9 @@ from scipy import ndimage
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import dijkstra
 
-from forward_grid_mapper.core.common.readings import Readings
+from forward_grid_mapper.core.common.readings import Floats, Readings
 from forward_grid_mapper.simulation.rays import NOTHING, cast
 from forward_grid_mapper.simulation.sonar import SonarArray, front_array, sonar_ring
-
-Floats = NDArray[np.float64]
 
 CELL = 0.1
 PIECE = 3.0

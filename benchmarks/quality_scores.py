@@ -15,9 +15,8 @@ from quality_worlds import Case
 
 from forward_grid_mapper.commands.experiment_maps import GAINS, standard_map
 from forward_grid_mapper.core.common.grid import Grid
+from forward_grid_mapper.core.common.readings import Floats
 from forward_grid_mapper.simulation.score import score_map
-
-Floats = NDArray[np.float64]
 
 CLIP = 0.02
 """Probabilities are clipped to this distance from 0 and 1 before the log loss."""

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from forward_grid_mapper.core.common.grid import Grid
 from forward_grid_mapper.core.common.parameters import Parameters
-from forward_grid_mapper.core.common.readings import Readings
+from forward_grid_mapper.core.common.readings import Floats, Readings
 from forward_grid_mapper.core.sensor.cone_table import cone_table, grid_of, walk_resized
 from forward_grid_mapper.recordings.read_drive import read_drive
 from forward_grid_mapper.simulation.drive import Recording, corridor_drive, door_drive, drive
@@ -24,8 +24,6 @@ from forward_grid_mapper.simulation.rays import NOTHING, cast
 from forward_grid_mapper.simulation.score import VISIBLE_RAYS
 from forward_grid_mapper.simulation.sonar import NOISY, NoiseModel, SonarArray, sonar_ring
 from forward_grid_mapper.simulation.world import Floorplan, World, rooms_world
-
-Floats = NDArray[np.float64]
 
 SHARED = Path(__file__).resolve().parents[2] / 'shared'
 RECORDINGS = ('office_a', 'office_b')

@@ -10,13 +10,12 @@ import math
 from collections.abc import Callable, Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import ndimage
 
 from forward_grid_mapper.core.common.grid import Grid
+from forward_grid_mapper.core.common.readings import Floats
 from forward_grid_mapper.simulation.world import World, cells_along
 
-Floats = NDArray[np.float64]
 Place = tuple[World, Floats]
 Point = tuple[float, float]
 

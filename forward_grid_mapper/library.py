@@ -14,6 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 from . import arrays
 from .core.common.errors import InputError, OutputError
 from .core.common.parameters import TABLE, Parameters
+from .core.common.words import counted
 from .core.mapping import Mapper, Watch
 from .core.maps.map_set import MapSet
 from .core.messages.extrinsics import Mount
@@ -189,11 +190,13 @@ def make_maps(
     values = arrays.column('ranges', ranges, len(stamps))
     names = [sensor_of] * len(values) if isinstance(sensor_of, str) else [str(name) for name in sensor_of]
     if len(names) != len(values):
-        raise InputError(f'sensor_of has {len(names)} names for {len(values)} ranges')
+        raise InputError(f'sensor_of has {counted(len(names), "name")} for {counted(len(values), "range")}')
     if unknown := sorted(set(names) - set(sensors)):
         raise InputError(f'no sensor is called {", ".join(unknown[:6])}; there are: {", ".join(sorted(sensors))}')
     if not odometry or not len(values):
-        raise InputError(f'there are {len(odometry)} poses and {len(values)} ranges; both are needed')
+        raise InputError(
+            f'there are {counted(len(odometry), "pose")} and {counted(len(values), "range")}; both are needed'
+        )
     mounted: dict[str, Pose2] = {name: Mount(s.x, s.y, s.yaw, -s.pitch) for name, s in sensors.items()}
     associator = PoseAssociator(lambda base, frame, stamp: mounted.get(frame), chosen, patient=True)
     live = FullLiveMap(associator, chosen)

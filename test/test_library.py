@@ -181,7 +181,7 @@ def test_parameters_may_be_numpy_scalars() -> None:
         ({'ranges': [1.0]}, 'ranges has the shape (1,), not'),
         ({'ranges': 'far'}, 'ranges must be numbers'),
         ({'pose_stamps': [[0.0, 1.0]]}, 'pose_stamps has the shape (1, 2), not (N,)'),
-        ({'sensor_of': ['sonar']}, 'sensor_of has 1 names for'),
+        ({'sensor_of': ['sonar']}, 'sensor_of has 1 name for'),
         ({'sensor_of': 'sonar'}, 'no sensor is called sonar; there are: '),
         ({'pose_stamps': [], 'poses': np.zeros((0, 3))}, 'there are 0 poses'),
         ({'sensors': {0: Sonar(0.0, 0.0, 0.0, 0.5, 3.0)}}, "must be strings, such as '0' in place of 0"),

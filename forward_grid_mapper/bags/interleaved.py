@@ -9,7 +9,7 @@ import heapq
 from collections import deque
 from collections.abc import Collection, Iterator, Sequence
 
-from .source import Channel, RawMessage, Source, one_line
+from .source import Channel, RawMessage, Source, close_all, one_line
 
 
 class Interleaved:
@@ -65,8 +65,7 @@ class Interleaved:
 
     def close(self) -> None:
         """Release the files."""
-        for source in self._sources:
-            source.close()
+        close_all(self._sources)
 
     def _messages_of(self, number: int, keys: Collection[int]) -> Iterator[RawMessage]:
         source, names = self._sources[number], self._keys[number]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import ExitStack
 from pathlib import Path, PurePath
 from typing import Any, NamedTuple
 
@@ -17,7 +18,7 @@ from .interleaved import interleaved
 from .mcap_chunks import indexed_messages
 from .repair import Problem, reasons_of, remedies_of, repair_hint
 from .salvage import Scan
-from .source import RosbagsSource, Source, one_line
+from .source import RosbagsSource, Source, close_all, one_line
 from .unpacking import NoSpaceError, UnpackedMessages, open_unpacked
 
 _KINDS: dict[bytes, tuple[str, type[Scan]]] = {
@@ -183,8 +184,7 @@ def _open_each(files: list[Path], compression: str) -> tuple[list[tuple[Path, So
                 problems.append(Problem(str(error).rstrip('.')))
                 continue
             # decompressed files must not remain in the temporary folder
-            for _, source in sources:
-                source.close()
+            close_all(source for _, source in sources)
             raise
     return sources, problems
 
@@ -242,16 +242,22 @@ def _open_by_index(file: Path, suffix: str, scan: Callable[[], Source]) -> Sourc
     size = file.stat().st_size
     reader: Any = rosbag1.Reader(file) if suffix == '.bag' else rosbag2.Reader(file)
     reader.open()
-    if suffix == '.bag':
-        budget = Budget(size)
-        reader.chunks = {
-            at: chunk._replace(decompressor=budget.metered(chunk.decompressor)) for at, chunk in reader.chunks.items()
-        }
-        return RosbagsSource(reader, 'ros1', scan)
-    if _has_full_index(reader) and _is_bounded(reader, size):
-        return RosbagsSource(reader, 'cdr', scan, indexed_messages)
-    reader.close()
-    return None
+    with ExitStack() as unused:
+        unused.callback(reader.close)
+        if suffix == '.bag':
+            budget = Budget(size)
+            reader.chunks = {
+                at: chunk._replace(decompressor=budget.metered(chunk.decompressor))
+                for at, chunk in reader.chunks.items()
+            }
+            source = RosbagsSource(reader, 'ros1', scan)
+        elif _has_full_index(reader) and _is_bounded(reader, size):
+            source = RosbagsSource(reader, 'cdr', scan, indexed_messages)
+        else:
+            return None
+        # the source closes it
+        unused.pop_all()
+        return source
 
 
 def _has_full_index(reader: Any) -> bool:

@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from ..core.common.errors import BagError, InputError
+from ..core.common.errors import BagError
 from ..core.messages.message_batch import MessageBatch, joined
 from ..core.messages.message_types import OdometryMessage, RangeMessage, range_message
 from ..core.messages.rep117 import proper_name
@@ -25,7 +25,7 @@ from .namespaces import by_precedence
 from .opening import open_sources
 from .poses import POSES
 from .repair import Problem, reasons_of, remedies_of, repair_hint
-from .source import Channel, RawMessage, Source, one_line
+from .source import Channel, RawMessage, Source, close_all, one_line
 from .static_transforms import StaticTransforms
 from .transform_chain import TransformChain, chain_of, constant_transforms
 
@@ -78,9 +78,8 @@ class Bag:
     ) -> None:
         """Close the bag."""
         self._problems = self._found_problems()
-        for source in self._sources:
-            source.close()
-        self._sources, self._files = [], []
+        sources, self._sources, self._files = self._sources, [], []
+        close_all(sources)
 
     @property
     def truncated(self) -> str | None:
@@ -242,7 +241,7 @@ class Bag:
             part = parts.setdefault(channel.topic, StaticTransforms(channel.topic))
             try:
                 for item in message.transforms:
-                    _add_transform(part, item)
+                    part.add_message(item)
             except (AttributeError, TypeError, ValueError):
                 self._count_undecodable(channel)
         transforms = StaticTransforms()
@@ -269,7 +268,7 @@ class Bag:
         """
         transforms = StaticTransforms('/tf')
         for parent, child, numbers in constant_transforms(self._searched(self.moving_topics())):
-            _add(transforms, parent, child, numbers[:3], numbers[3:])
+            transforms.add_if_valid(parent, child, numbers[:3], numbers[3:])
         transforms.take(self.static_transforms(topics))
         return transforms
 
@@ -392,19 +391,3 @@ def _decoding(channels: Mapping[int, Channel], chain: TransformChain | None) -> 
     if chain is not None and moving:
         found[moving] = InOrder(decoder_of(channels[moving[0]]), chain.pose)
     return found
-
-
-def _add_transform(transforms: StaticTransforms, item: Any) -> None:
-    offset, turn = item.transform.translation, item.transform.rotation
-    parent, child = str(item.header.frame_id), str(item.child_frame_id)
-    _add(transforms, parent, child, (offset.x, offset.y, offset.z), (turn.x, turn.y, turn.z, turn.w))
-
-
-def _add(
-    transforms: StaticTransforms, parent: str, child: str, offset: Sequence[float], quaternion: Sequence[float]
-) -> None:
-    try:
-        transforms.add(parent, child, offset, quaternion)
-    except InputError as error:
-        # A wrong transform elsewhere on the robot must not prevent a map that does not need it.
-        transforms.rejected[child.lstrip('/')] = str(error)

@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Collection, Iterator
+from collections.abc import Callable, Collection, Iterable, Iterator
+from contextlib import ExitStack
 from functools import partial
 from typing import Any, NamedTuple, Protocol
+
+from ..core.common.words import counted
 
 RawMessage = tuple[int, int, bytes]
 """Channel key, log time in nanoseconds, serialized message."""
@@ -48,6 +51,13 @@ class Source(Protocol):
 
     def close(self) -> None:
         """Release the file."""
+
+
+def close_all(sources: Iterable[Source]) -> None:
+    """Close sources, also the others if one cannot be closed: some have a temporary folder with gigabytes."""
+    with ExitStack() as closing:
+        for source in sources:
+            closing.callback(source.close)
 
 
 def one_line(error: BaseException) -> str:
@@ -126,7 +136,7 @@ class RosbagsSource:
             self.damage = one_line(error)
         expected = sum(c.msgcount for c in connections)
         if self.damage is None and seen < expected:
-            self.damage = f'the index promises {expected} messages, only {seen} were found'
+            self.damage = f'the index promises {counted(expected, "message")}, only {seen} were found'
         if self.damage is not None and self._scan is not None:
             yield from self._rest(keys, last, Counter(at_last))
 

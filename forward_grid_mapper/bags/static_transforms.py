@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from itertools import takewhile
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -85,6 +86,22 @@ class StaticTransforms:
             )
         self._parents[child] = parent, transform
         self.rejected.pop(child, None)
+
+    def add_if_valid(
+        self, parent: str, child: str, translation_xyz: Sequence[float], quaternion_xyzw: Sequence[float]
+    ) -> None:
+        """Add a pose as `add` does, or note in `rejected` why it is invalid."""
+        try:
+            self.add(parent, child, translation_xyz, quaternion_xyzw)
+        except InputError as error:
+            # a wrong transform elsewhere on the robot must not prevent a map that does not need it
+            self.rejected[_plain(child)] = str(error)
+
+    def add_message(self, message: Any) -> None:
+        """Apply `add_if_valid` to a `geometry_msgs/TransformStamped`."""
+        offset, turn = message.transform.translation, message.transform.rotation
+        parent, child = str(message.header.frame_id), str(message.child_frame_id)
+        self.add_if_valid(parent, child, (offset.x, offset.y, offset.z), (turn.x, turn.y, turn.z, turn.w))
 
     def take(self, other: StaticTransforms) -> None:
         """Add the transforms of other topics, which take precedence."""

@@ -77,8 +77,10 @@ class _InFolder:
         return self._source.messages(keys)
 
     def close(self) -> None:
-        self._source.close()
-        shutil.rmtree(self._folder, ignore_errors=True)
+        try:
+            self._source.close()
+        finally:
+            shutil.rmtree(self._folder, ignore_errors=True)
 
 
 def open_unpacked(file: Path, open_file: Callable[[Path], Source]) -> Source:

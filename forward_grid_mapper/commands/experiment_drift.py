@@ -12,11 +12,11 @@ from numpy.typing import NDArray
 
 from ..core.common.grid import Grid
 from ..core.common.parameters import Parameters
-from ..core.common.readings import Readings
+from ..core.common.readings import Floats, Readings
 from ..core.common.words import counted
 from ..core.mapping import Mapper
 from ..core.trajectory.local_map import at_poses
-from ..core.trajectory.poses import Floats, compose, rms_after_alignment
+from ..core.trajectory.poses import compose, rms_after_alignment
 from ..core.trajectory.refinement import Refiner
 from ..core.trajectory.windows import Odometry
 from ..files.panels import Box, Tile

@@ -106,9 +106,9 @@ class LiveNode:
                 self._client.destroy_node()
             rclpy.try_shutdown()
         finally:
-            if self._process is not None:
-                end_child(self._process)
-            self._domain.close()
+            with self._domain:
+                if self._process is not None:
+                    end_child(self._process)
 
     def run(self, *arguments: str) -> None:
         """Run another command while the node runs, and wait for its end.

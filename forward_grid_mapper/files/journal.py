@@ -297,7 +297,7 @@ class Journal:
                     self._writer.check_file()
                     self._steady()
             except GoneError as error:
-                self._lose(error.drive, str(error))
+                self._give_up_file(error.drive, str(error))
             except Exception as error:
                 # of any class: the thread must not end silently
                 if not self._smaller(items) and self._failed(error):
@@ -321,8 +321,11 @@ class Journal:
                 self._warn(f'journal {self.path}: writing works again')
                 self.trouble = ''
 
-    def _lose(self, drive: Drive, why: str) -> None:
-        """Handle a file that vanished or was damaged."""
+    def _give_up_file(self, drive: Drive, why: str) -> None:
+        """Write no more to a file that vanished or was damaged, and have a new one made.
+
+        For the current drive, `renew` makes it: only the node has the readings that were in the old one.
+        """
         self._notice(f'journal {drive.path}: {why}; the readings in memory are written to a new file')
         with self._wake:
             if drive is self._drive:

@@ -8,10 +8,9 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 from ..core.common.words import counted
-from ..core.messages.message_account import MOST_FRAMES
 from ..core.messages.message_types import NANOSECONDS
 from ..core.messages.pose_association import PoseAssociator
-from ..core.messages.rep117 import proper_name
+from ..core.messages.sensor_records import has_room
 
 LASTING = 10.0
 """Seconds for which a jump counts, and between two warnings in the log."""
@@ -110,7 +109,7 @@ class SensorClocks:
             return
         lag, window = odometry - stamp, self._windows.get(frame)
         if window is None or odometry < window.begin:
-            if window is not None or (len(self._windows) < MOST_FRAMES and proper_name(frame)):
+            if has_room(self._windows, frame):
                 self._windows[frame] = _Window(odometry, odometry, lag, lag)
             return
         window.last, window.count = odometry, window.count + 1

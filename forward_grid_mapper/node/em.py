@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import time
 from collections.abc import Callable
 from contextlib import suppress
@@ -51,7 +52,8 @@ class Run:
     `stage` and `progress` are updated during the run. `found` is called with the maps once they are found, in the
     thread. `shown` is true once an intermediate map was published, `end_requested` if cancel_em was called.
     `by_itself` is true if the node began the run and no call waits for it; `fresh` returns whether the run uses all
-    readings so far. `then` are those who wait for the run after it.
+    readings so far. At its end, `own` are called with the outcome, the work of the node itself; then `waiting`, those
+    who wait for the run. `then` are those who wait for the run after it.
     """
 
     mapper: Mapper | RefiningMapper
@@ -69,6 +71,7 @@ class Run:
     by_itself: bool = False
     fresh: Callable[[], bool] = lambda: True
     then: list[Callable[[Outcome], object]] = field(default_factory=list)
+    own: list[Callable[[Outcome], object]] = field(default_factory=list)
     waiting: list[Callable[[Outcome], object]] = field(default_factory=list)
 
     @property
@@ -121,10 +124,10 @@ class EmWorker:
         self._watch, self._conclude, self._prepare = watch, conclude, prepare
 
     def start(self, run: Run, done: Callable[[Outcome], object]) -> bool:
-        """Begin a run, and return True; False if there is a current one. `done` is called at its end."""
+        """Begin a run, and return True; False if there is a current one. `done` is called first at its end."""
         if self.current is not None:
             return False
-        run.waiting.append(done)
+        run.own.append(done)
         self.current = run
         self.worker.put(lambda: self._work(run), lambda why: self._end(run, Outcome(None, f'EM failed: {why}')))
         return True
@@ -181,13 +184,14 @@ class EmWorker:
         except MemoryError:
             return Outcome(
                 None,
-                f'EM of {run.count} readings does not fit into the memory; call reset, or use a coarser resolution',
+                f'EM of {counted(run.count, "reading")} does not fit into the memory; call reset, or use a coarser '
+                'resolution',
             )
 
     def _end(self, run: Run, outcome: Outcome) -> None:
         def conclude() -> None:
             self.current = None
-            for done in run.waiting:
+            for done in itertools.chain(run.own, run.waiting):
                 try:
                     done(outcome)
                 except Exception as error:

@@ -31,9 +31,6 @@ from .refining import Drive, Found, RefiningMapper
 from .sensor_status import SensorWatch
 from .trajectory import Trajectory
 
-OWN_CALLBACKS = 2
-"""Number of callbacks of a run itself, which precede those of callers in `Run.waiting`."""
-
 LOG_PERIOD = 10.0
 """Seconds between two lines of progress in the log while the trajectory is estimated."""
 
@@ -159,8 +156,9 @@ class EmService:
         """Begin a run without a caller; return False if there is a current run, or if there are no readings."""
         if self.current is not None or not len(self._associator.buffer):
             return False
-        run = self._start(lambda outcome: self._begin_replacement(run))
+        run = self._start()
         run.by_itself = True
+        run.own.append(lambda outcome: self._begin_replacement(run))
         return True
 
     def _replace(self, run: Run, done: Callable[[Outcome], object]) -> None:
@@ -168,8 +166,8 @@ class EmService:
         run.by_itself = False
         if not run.cancelled:
             # callers that wait for it, such as save_maps, wait for the other one
-            run.then += run.waiting[OWN_CALLBACKS:]
-            del run.waiting[OWN_CALLBACKS:]
+            run.then += run.waiting
+            run.waiting.clear()
         run.then.append(done)
         self.worker.cancel()
 
@@ -177,9 +175,8 @@ class EmService:
         """After a cancelled run, begin the run that replaces it, if any."""
         if not run.then:
             return
-        first, *others = run.then
         try:
-            self._start(first).waiting.extend(others)
+            self._start(*run.then)
         except Exception as error:
             _fail_all(run.then, f'EM cannot begin: {reason(error)}')
             raise
@@ -230,8 +227,8 @@ class EmService:
         """Cancel the current run, and wait at most so many seconds for its end."""
         self.worker.close(seconds)
 
-    def _start(self, done: Callable[[Outcome], object]) -> Run:
-        """Begin a run; `done` is called with its outcome, before callbacks that are added later."""
+    def _start(self, *callers: Callable[[Outcome], object]) -> Run:
+        """Begin a run, and have callers called with its outcome."""
         generation, bound = self._publishers.generation, self._associator.buffer.bound
         # readings that arrive while kernels are compiled are mapped as well
         early = not all(map(self._kernels.has, self._needed()))
@@ -303,7 +300,7 @@ class EmService:
         run = Run(mapper, parameters, readings, found, start, fresh=fresh)
         self._generation = generation
         self.worker.start(run, finish)
-        run.waiting.append(done)
+        run.waiting.extend(callers)
         return run
 
     def _take(self) -> RunInput:

@@ -5,8 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Iterator
 
-from ..core.messages.message_account import MOST_FRAMES
-from ..core.messages.rep117 import proper_name
+from ..core.messages.sensor_records import has_room
 
 TIME_OUT = 3.0
 """Shortest time without a message, seconds, after which a sensor is silent."""
@@ -60,7 +59,7 @@ class Heard:
             elif gap < _patience(interval):
                 interval += 0.1 * (gap - interval)
             self._sensors[frame] = now, interval
-        elif len(self._sensors) < MOST_FRAMES and proper_name(frame):
+        elif has_room(self._sensors, frame):
             self._sensors[frame] = now, 0.0
 
     @property

@@ -12,6 +12,7 @@ from rclpy.node import Node
 
 from ..core.common.errors import OutputError
 from ..core.common.parameters import Parameters
+from ..core.common.words import counted
 from ..core.messages.pose_association import PoseAssociator
 from ..files.journal import Journal
 from ..files.journal_format import stated
@@ -98,7 +99,7 @@ class JournalKeeper:
         self._restored = self._taken = len(associator.buffer)
         self._last_point = associator.path[-1] if associator.path else None
         logger.info(
-            f'journal {journal.path}: {self._restored} readings of an earlier run are restored, in frame '
+            f'journal {journal.path}: restored {counted(self._restored, "reading")} of an earlier run, in frame '
             f'{associator.map_frame or "(none yet)"}'
         )
         if refused:
@@ -157,7 +158,7 @@ class JournalKeeper:
         values: dict[str, Any] = {'folder': self._folder, 'readings restored': self._restored}
         if journal is not None:
             if journal.lost:
-                trouble = trouble or f'{journal.lost} readings were received while nothing could be written'
+                trouble = trouble or f'{counted(journal.lost, "reading")} came while nothing could be written'
             if time.monotonic() < journal.noticed + NOTICE:
                 trouble = trouble or journal.notice
             values |= {

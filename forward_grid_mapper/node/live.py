@@ -13,6 +13,7 @@ from ..core.common.errors import MapperError
 from ..core.common.grid import Grid
 from ..core.common.parameters import Parameters
 from ..core.common.readings import Readings
+from ..core.common.words import counted
 from ..core.maps.log_odds_map import LogOddsMap
 from .background import Worker
 
@@ -129,7 +130,7 @@ class LiveMap:
             self._map.add(readings if place is None else place(readings))
         except (MapperError, MemoryError) as error:
             why = str(error) or 'there is not enough memory'
-            raise MapperError(f'{len(readings)} readings are not in the live map: {why}') from None
+            raise MapperError(f'{counted(len(readings), "reading")} cannot be added to the live map: {why}') from None
         self.grid = self._map.grid
 
     def _replace(self, made: LogOddsMap, generation: int) -> None:

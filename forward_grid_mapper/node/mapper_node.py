@@ -16,6 +16,7 @@ from std_srvs.srv import SetBool, Trigger
 
 from ..core.common.errors import MapperError, ParameterError
 from ..core.common.parameters import Parameters
+from ..core.common.words import counted
 from ..core.messages.message_types import NANOSECONDS
 from ..core.messages.pose_association import PoseAssociator
 from ..core.messages.rep117 import rejection_warnings, sensor_rejections
@@ -343,7 +344,7 @@ class MapperNode(ManagedNode):
         self.maps.clear()
         self.em.reset()
         self.feed.reset()
-        reply.send(True, f'{forgotten} readings and all maps were deleted{kept}')
+        reply.send(True, f'{counted(forgotten, "reading")} and all maps were deleted{kept}')
 
     def pause(self, reply: Reply) -> None:
         """Pause or continue mapping; answer the service."""

@@ -14,6 +14,7 @@ from ..core.common.errors import Cancelled, MapperError
 from ..core.common.grid import Grid
 from ..core.common.parameters import Parameters
 from ..core.common.readings import Readings
+from ..core.common.words import counted
 from ..core.maps.map_set import MapSet
 from ..core.online_map import OnlineMap
 from .background import Worker
@@ -146,7 +147,7 @@ class OnlineWorker:
                 # the readings are in the map, so this is no lasting failure
                 self._log(f'online map: the search will continue with the next readings: {why}')
                 return
-            raise MapperError(f'{len(new)} readings are not in the online map: {why}') from None
+            raise MapperError(f'{counted(len(new), "reading")} cannot be added to the online map: {why}') from None
         finally:
             if wanted is self._map:
                 self.kept = len(wanted)

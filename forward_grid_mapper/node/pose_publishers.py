@@ -18,9 +18,9 @@ from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped, TransformS
 from nav_msgs.msg import Path
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 
+from ..core.common.readings import Floats
 from ..core.messages.message_types import NANOSECONDS, Pose2, stamp_of
 from ..core.messages.stamp_order import JUMP
-from ..core.trajectory.poses import Floats
 from ..core.trajectory.windows import Odometry
 
 PERIOD = 0.05

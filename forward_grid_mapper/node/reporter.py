@@ -8,10 +8,10 @@ from typing import Any
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 
 from ..core.messages.extrinsics import STEEP
-from ..core.messages.message_account import MOST_FRAMES
 from ..core.messages.mounts import far_mounts
 from ..core.messages.pose_association import PoseAssociator
 from ..core.messages.rep117 import OF_POSES, REASONS, sensor_rejections
+from ..core.messages.sensor_records import MOST_FRAMES
 from . import diagnostics
 from .background import Worker
 from .em_service import EmService

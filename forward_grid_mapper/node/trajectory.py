@@ -23,7 +23,7 @@ from ..core.messages.message_types import Pose2
 from ..core.messages.pose_association import PoseAssociator
 from ..core.trajectory.correction import Correction
 from ..core.trajectory.jumps import jumps, may_jump
-from ..core.trajectory.refinement import SHORTEST
+from ..core.trajectory.refinable import SHORTEST
 from ..core.trajectory.windows import STILL, Odometry
 from ..files.report_text import UNTESTED
 from ..files.trajectory_text import calibration_words

@@ -74,9 +74,11 @@ class Publishers:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         """End the node."""
-        if self._node is not None:
-            self._node.destroy_node()
-        self._ros.try_shutdown()
+        try:
+            if self._node is not None:
+                self._node.destroy_node()
+        finally:
+            self._ros.try_shutdown()
 
     def add(self, topic: str, msgtype: str, latched: bool = False, depth: int = 0) -> None:
         """Create the publisher of a topic, which keeps this name here even if it is remapped.

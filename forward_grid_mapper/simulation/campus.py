@@ -15,8 +15,9 @@ from functools import lru_cache
 import numpy as np
 
 from ..core.common.grid import Grid
+from ..core.common.readings import Floats
 from ..core.messages.message_types import NANOSECONDS
-from .drive import START, Floats, Recording, drive_sweeps
+from .drive import START, Recording, drive_sweeps
 from .sonar import NOISY, NoiseModel, SonarArray, sonar_ring
 from .world import Door, World, building_tour, building_world
 

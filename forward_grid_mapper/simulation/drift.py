@@ -15,13 +15,11 @@ import math
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ..core.common.readings import Floats
 from ..core.messages.message_types import Pose2
 from ..core.trajectory.windows import Odometry
 from .drive import Recording
-
-Floats = NDArray[np.float64]
 
 STEP = 0.05
 """Metres of driving for each draw of noise; 0.15 rad of turning count as much."""

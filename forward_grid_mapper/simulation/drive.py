@@ -8,14 +8,12 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ..core.common.readings import Readings
+from ..core.common.readings import Floats, Readings
 from ..core.messages.message_types import NANOSECONDS, OdometryMessage, Pose2, RangeMessage
 from .rays import blocked, cast
 from .sonar import NOISE_FREE, NOISY, PERSON_RADIUS, NoiseModel, SonarArray, measure, sonar_ring
 from .trajectory import Trajectory
 from .world import World, building_tour, building_world, corridor_world, door_world, doors_world
-
-Floats = NDArray[np.float64]
 
 ODOM_FRAME = 'odom'
 BASE_FRAME = 'base_link'

@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-Floats = NDArray[np.float64]
+from ..core.common.readings import Floats
+
 NOTHING = -1
 _CHUNK = 200_000  # ray-segment pairs at a time: temporaries stay within the cache
 _SLACK = 1e-9  # so that no ray slips through where two walls meet

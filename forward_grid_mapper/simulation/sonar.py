@@ -16,11 +16,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from ..core.common.readings import Floats
 from ..core.messages.message_types import Pose2
 from .rays import NOTHING, cast, cast_discs
 from .world import World
-
-Floats = NDArray[np.float64]
 
 RAYS = 31  # half a degree apart in a cone of 15°: the nearest point of a wall is met to 1e-5 of its distance
 SMOOTH_ECHO = math.radians(20.0)

@@ -6,9 +6,8 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-Floats = NDArray[np.float64]
+from ..core.common.readings import Floats
 
 SPEED = 0.5  # m/s
 TURN_RATE = 1.0  # rad/s

@@ -11,6 +11,7 @@ from bag_samples import storage_file, write_sample
 
 from forward_grid_mapper.bags import unpacking
 from forward_grid_mapper.bags.reader import Bag
+from forward_grid_mapper.bags.source import RosbagsSource
 from forward_grid_mapper.core.common.errors import BagError
 
 METADATA = """rosbag2_bagfile_information:
@@ -47,6 +48,18 @@ def test_unpacked_files_are_deleted_with_the_bag(split: Path, temporary: Path) -
     with Bag(split) as bag:
         assert len(list(temporary.iterdir())) == 2
         assert bag.topics()
+    assert not list(temporary.iterdir())
+
+
+def test_file_that_cannot_be_closed_leaves_no_files(
+    split: Path, temporary: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fails(source: RosbagsSource) -> None:
+        raise OSError('cannot be closed')
+
+    monkeypatch.setattr(RosbagsSource, 'close', fails)
+    with pytest.raises(OSError, match='cannot be closed'), Bag(split) as bag:
+        assert len(list(temporary.iterdir())) == 2 and bag.topics()
     assert not list(temporary.iterdir())
 
 

@@ -11,6 +11,7 @@ pytest.importorskip('rclpy', reason='the tests of the node need rclpy')
 
 from inside import Inside
 
+from forward_grid_mapper.core.messages.sensor_records import MOST_FRAMES
 from forward_grid_mapper.node import heard
 from forward_grid_mapper.node.heard import TIME_OUT, USUAL, Heard
 
@@ -113,13 +114,13 @@ def test_interval_of_sensors_that_all_send_rarely_is_learned(clock: Clock) -> No
 
 def test_unprintable_names_and_too_many_are_ignored(clock: Clock) -> None:
     sensors = Heard()
-    for name in ('', 'a\nb', 'x' * 256, *(f'made up {k}' for k in range(2 * heard.MOST_FRAMES))):
+    for name in ('', 'a\nb', 'x' * 256, *(f'made up {k}' for k in range(2 * MOST_FRAMES))):
         sensors.note(name)
     assert '' not in sensors and 'a\nb' not in sensors and 'x' * 256 not in sensors
     for _ in range(4):
         clock.now += TIME_OUT - 0.5
         sensors.note('made up 0')
-    assert len(sensors.silent()) == heard.MOST_FRAMES - 1
+    assert len(sensors.silent()) == MOST_FRAMES - 1
 
 
 def test_diagnostics_name_the_silent_sensor(inside: Callable[..., Inside], monkeypatch: pytest.MonkeyPatch) -> None:

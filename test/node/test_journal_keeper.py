@@ -115,7 +115,7 @@ def test_new_readings_are_written_and_restored(tmp_path: Path) -> None:
     assert len(again.associator.buffer) == 12
     assert (again.associator.map_frame, again.associator.base_frame) == ('odom', 'base_link')
     assert list(again.associator.path) == [(0.0, 1.0), (5.0, 1.0)]
-    assert '12 readings of an earlier run are restored, in frame odom' in again.node.warned[0]
+    assert 'restored 12 readings of an earlier run, in frame odom' in again.node.warned[0]
     assert again.values()['readings restored'] == '12'
     again.drive(12, 3)
     again.keeper.close()
@@ -126,7 +126,7 @@ def test_new_readings_are_written_and_restored(tmp_path: Path) -> None:
 
 def test_new_journal_has_no_frame(tmp_path: Path) -> None:
     kept = KeptJournal(tmp_path).start()
-    assert '0 readings of an earlier run are restored, in frame (none yet)' in kept.node.warned[0]
+    assert 'restored 0 readings of an earlier run, in frame (none yet)' in kept.node.warned[0]
     assert len(kept.node.warned) == 1
     kept.keeper.close()
 
@@ -229,7 +229,7 @@ def test_status_has_waiting_and_lost_readings(tmp_path: Path) -> None:
     assert journal is not None
     journal.lost = 7
     assert kept.status().level == WARN and kept.values()['readings lost'] == '7'
-    assert kept.status().message == '7 readings were received while nothing could be written'
+    assert kept.status().message == '7 readings came while nothing could be written'
     # present faults come before past ones
     journal.trouble = 'the disk is broken'
     assert kept.status().message == 'the disk is broken'

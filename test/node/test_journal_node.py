@@ -54,7 +54,7 @@ def test_killed_node_continues_after_a_restart(
     rng = random.Random(4)
     for run in range(2):
         node = start(*options)
-        assert f'{sent} readings of an earlier run are restored' in node.output
+        assert f'restored {sent} readings of an earlier run' in node.output
         robot = Robot(domain)
         try:
             robot.meet()
@@ -99,7 +99,7 @@ def test_killed_node_continues_after_a_restart(
         robot.close()
     assert node.stop() == 0
     node = start(*options)
-    assert '50 readings of an earlier run are restored' in node.output
+    assert 'restored 50 readings of an earlier run' in node.output
     # a node that ended normally leaves no log, a running one has a log
     files = {path.name for path in folder.iterdir()}
     assert files - {'drive_0002.journal-wal'} == {'drive_0001.journal', 'drive_0002.journal', 'lock'}
@@ -172,7 +172,7 @@ def test_deleted_or_hostile_journal_is_replaced(start: Any, domain: int, robot: 
     path.write_bytes(b'SQLite format 3\0' + bytes(range(256)) * 100)
     node = start(*options)
     assert 'the journal continues in drive_0003.journal' in node.output
-    assert '0 readings of an earlier run are restored' in node.output
+    assert 'restored 0 readings of an earlier run' in node.output
     # a new client, since the first one still counts the killed node among its subscribers
     other = Robot(domain)
     try:

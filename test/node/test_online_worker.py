@@ -272,7 +272,7 @@ def test_readings_that_could_not_be_added_are_reported_until_restart(
     maps.error = error
     node.worker.offer(readings(4))
     node.settle()
-    expected = f'4 readings are not in the online map: {why}'
+    expected = f'4 readings cannot be added to the online map: {why}'
     assert node.logged == [f'online map: {expected}']
     maps.error = None
     node.worker.offer(readings(2))

@@ -460,7 +460,7 @@ def test_failing_worker_is_in_the_diagnostics_and_mapping_continues(
     robot.until(lambda: node.online.worker.trouble)
     background = robot.status('background')
     assert background['level'] == WARN
-    assert 'readings are not in the online map: there is not enough memory' in background['message']
+    assert 'readings cannot be added to the online map: there is not enough memory' in background['message']
     monkeypatch.setattr(OnlineMap, 'add', add)
     assert robot.call(node.em.run_em)[0]
     robot.drive(20, 20)

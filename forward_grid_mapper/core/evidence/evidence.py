@@ -10,9 +10,9 @@ from numpy.typing import NDArray
 
 from ..common.grid import UNKNOWN, Grid, Window, united
 from ..common.parameter_groups import ModelParameters
-from ..common.readings import Readings
+from ..common.readings import Floats, Readings
 from ..runtime.cancelling import NEVER
-from ..sensor.cone_table import Floats, cone_table
+from ..sensor.cone_table import cone_table
 from ..sensor.surface_normals import SurfaceNormals, no_normals, on_larger_grid, touched
 from .fixed_point import QUANTUM
 from .indexed_readings import IndexedReadings, empty_maps

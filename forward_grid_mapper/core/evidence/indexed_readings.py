@@ -11,10 +11,11 @@ from numpy.typing import NDArray
 
 from ..common.grid import Grid
 from ..common.parameter_groups import ModelParameters
+from ..common.readings import Floats
 from ..runtime.cancelling import check
 from ..runtime.memory import THREAD_MEMORY
 from ..runtime.threads import parts, run_each
-from ..sensor.cone_table import CONE, Cones, Floats
+from ..sensor.cone_table import CONE, Cones
 from ..sensor.density import hit_probability
 from ..sensor.surface_normals import SurfaceNormals
 from .fixed_point import QUANTUM

@@ -8,10 +8,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..common.parameter_groups import ModelParameters
-from ..common.readings import Readings
+from ..common.readings import Floats, Readings
 from ..runtime.jit import kernel
 from ..sensor.cone import rows_of, runs_of
-from ..sensor.cone_table import Floats, cone_of
+from ..sensor.cone_table import cone_of
 from ..sensor.density import causes_of
 from .pairs import WORDS_PER_BAND_PAIR, WORDS_PER_RUN
 from .state import READING_STATE, State

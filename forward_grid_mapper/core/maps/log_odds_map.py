@@ -30,8 +30,8 @@ from numpy.typing import NDArray
 from ..common.constants import ARC, arc_depths
 from ..common.grid import Grid
 from ..common.parameters import Parameters
-from ..common.readings import Readings
-from ..sensor.cone_table import Floats, check_size, grid_of
+from ..common.readings import Floats, Readings
+from ..sensor.cone_table import check_size, grid_of
 from .log_odds_kernel import PADDING, UNTOUCHED, Beams, InverseModel, StoredGrid, add_readings, is_steep
 
 MARGIN = 64

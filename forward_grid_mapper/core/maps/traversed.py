@@ -12,9 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..common.grid import Grid
-from ..common.readings import Readings, drives_of
+from ..common.readings import Floats, Readings, drives_of
 from ..runtime.jit import kernel
-from ..sensor.cone_table import Floats
 
 LONGEST_PAUSE = 500_000_000
 """Longest time between two readings that a line joins, nanoseconds; after a longer one the path is unknown."""

@@ -32,8 +32,8 @@ from numpy.typing import NDArray
 
 from ..common.constants import LEAST_EVIDENCE, LEAST_NOTICING
 from ..common.parameter_groups import SearchParameters
+from ..common.readings import Floats
 from ..evidence.neighbourhood import continues, occupied_of, patterns
-from ..sensor.cone_table import Floats
 from .free_space import Passes
 
 HOLE, INSIDE, STEP, END, BESIDE, ALONE = 1.10, 0.20, -0.20, -1.23, -2.56, -1.95

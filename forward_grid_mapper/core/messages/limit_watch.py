@@ -10,10 +10,9 @@ from __future__ import annotations
 import numpy as np
 
 from ..common.readings import Floats
-from .message_account import MOST_FRAMES
 from .message_batch import Ranges
 from .message_types import RangeMessage
-from .rep117 import proper_name
+from .sensor_records import record_of
 
 SAMPLES = 256
 """Most messages of a sensor that are sampled; they are spread over the whole drive."""
@@ -101,21 +100,15 @@ class LimitWatch:
 
     def add(self, message: RangeMessage) -> None:
         """Take a message."""
-        if samples := self._samples(message.frame_id):
+        if samples := record_of(self._of, message.frame_id, _Samples):
             samples.add(message.range, message.min_range, message.max_range)
 
     def add_all(self, messages: Ranges) -> None:
         """Apply `add` to many messages."""
         values = np.stack([messages.range, messages.min_range, messages.max_range], axis=1)
         for frame, part in messages.of_each():
-            if samples := self._samples(frame):
+            if samples := record_of(self._of, frame, _Samples):
                 samples.add_all(values[part])
-
-    def _samples(self, frame: str) -> _Samples | None:
-        """Return the samples of a sensor; None if its name is none, or if there are too many sensors."""
-        if frame not in self._of and len(self._of) < MOST_FRAMES and proper_name(frame):
-            self._of[frame] = _Samples()
-        return self._of.get(frame)
 
     def warnings(self) -> list[str]:
         """Return warnings; empty if there is no suspicion."""

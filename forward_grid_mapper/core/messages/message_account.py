@@ -6,11 +6,10 @@ from collections import Counter
 
 from .message_types import RangeMessage
 from .rep117 import LONGEST_NAME
-
-MOST_FRAMES = 1000
-"""Most sensor frames with counts of their own; others are counted as `OTHERS`."""
+from .sensor_records import MOST_FRAMES
 
 OTHERS = '(other frames)'
+"""Stands for the frames beyond `MOST_FRAMES`, and for those whose names are too long: they are counted together."""
 
 
 class MessageAccount:

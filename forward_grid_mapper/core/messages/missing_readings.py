@@ -16,10 +16,9 @@ from bisect import bisect_right
 import numpy as np
 from numpy.typing import NDArray
 
-from .message_account import MOST_FRAMES
 from .message_batch import Ranges
 from .message_types import NANOSECONDS, RangeMessage
-from .rep117 import proper_name
+from .sensor_records import record_of
 
 EDGES: NDArray[np.int64] = np.round(np.geomspace(1e6, 10.0 * NANOSECONDS, 200)).astype(np.int64)
 """Nanoseconds between which intervals are counted; shorter and longer ones are not."""
@@ -106,7 +105,7 @@ class MissingReadings:
         if self._farthest < message.max_range < FARTHEST:
             self._farthest = message.max_range
         self._together.add(message.stamp)
-        if own := self._intervals(message.frame_id):
+        if own := record_of(self._of, message.frame_id, _Intervals):
             own.add(message.stamp)
 
     def add_all(self, messages: Ranges) -> None:
@@ -117,14 +116,8 @@ class MissingReadings:
         self._farthest = float(messages.max_range[messages.max_range < FARTHEST].max(initial=self._farthest))
         self._together.add_all(messages.stamp)
         for frame, part in messages.of_each():
-            if own := self._intervals(frame):
+            if own := record_of(self._of, frame, _Intervals):
                 own.add_all(messages.stamp[part])
-
-    def _intervals(self, frame: str) -> _Intervals | None:
-        """Return the intervals of a sensor; None if its name is none, or if there are too many sensors."""
-        if frame not in self._of and len(self._of) < MOST_FRAMES and proper_name(frame):
-            self._of[frame] = _Intervals()
-        return self._of.get(frame)
 
     def warnings(self) -> list[str]:
         """Return a warning; empty if there is no suspicion."""

@@ -11,9 +11,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ..common.readings import Floats
 from .message_types import NANOSECONDS, Pose2
-
-Floats = NDArray[np.float64]
 
 MOST_POSES = 300_000
 """Most poses, 10 MB. If there are more, those are dropped that interpolation between their neighbours replaces best. At

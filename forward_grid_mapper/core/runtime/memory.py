@@ -10,6 +10,7 @@ import resource
 from pathlib import Path
 
 from ..common.parameters import Parameters
+from ..common.words import counted
 from .control_groups import control_groups
 
 BYTES_A_READING = 400
@@ -65,8 +66,8 @@ def shortage(cells: int, readings: int, threads: int) -> str:
     if free is None or needed <= free:
         return ''
     return (
-        f'EM of {readings} readings takes {_words(needed)}, and {_words(free)} are free; lower max_readings, use a '
-        'coarser resolution, or call reset'
+        f'EM of {counted(readings, "reading")} takes {_words(needed)}, and {_words(free)} are free; lower '
+        'max_readings, use a coarser resolution, or call reset'
     )
 
 

@@ -27,11 +27,11 @@ from ..common.constants import (
     MOST_AGAINST_PASSAGE,
     PASSAGE,
 )
+from ..common.readings import Floats
 from ..evidence.neighbourhood import DX, DY, NEIGHBOURS
 from ..evidence.state import State
 from ..evidence.updates import flip
 from ..runtime.jit import kernel
-from ..sensor.cone_table import Floats
 from .flips import Least, gain_of
 from .prior import Prior
 

@@ -21,9 +21,9 @@ from numpy.typing import NDArray
 
 from ..common.constants import FORBIDDEN
 from ..common.parameter_groups import SearchParameters
+from ..common.readings import Floats
 from ..evidence.neighbourhood import NEIGHBOURS, continues, offset, opposite, patterns
 from ..runtime.jit import allocating_kernel, inlined_kernel
-from ..sensor.cone_table import Floats
 
 
 class Prior(NamedTuple):

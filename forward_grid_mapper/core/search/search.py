@@ -33,11 +33,11 @@ from numpy.typing import NDArray
 from ..common.constants import FORBIDDEN, LONGEST_GAP, SHORT_WALL
 from ..common.grid import Window
 from ..common.parameter_groups import SearchParameters
+from ..common.readings import Floats
 from ..evidence.evidence import Evidence
 from ..evidence.neighbourhood import NEIGHBOURS
 from ..evidence.state import State
 from ..runtime.cancelling import check
-from ..sensor.cone_table import Floats
 from .flips import flip_in_order, free_unneeded, highest, promising
 from .gap_closing import close_gaps, remove_short_walls
 from .prior import Prior, has_walls, independent_prior, log_prior, wall_prior

@@ -18,13 +18,13 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from ..common.readings import Floats
 from ..evidence.fixed_point import RatioWorkspace, quantise_logs, ratio_workspace_for
 from ..evidence.neighbourhood import NEIGHBOURS, neighbour, note_flip
 from ..evidence.pairs import WORDS_PER_RUN, Pairs
 from ..evidence.state import State
 from ..evidence.updates import find_observing, flip, pairs_of, ratios_and_logs
 from ..runtime.jit import allocating_kernel, inlined_kernel, kernel
-from ..sensor.cone_table import Floats
 from .flips import Least, gain_of, least_gain
 from .prior import Prior
 

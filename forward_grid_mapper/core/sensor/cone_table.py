@@ -20,13 +20,10 @@ from numpy.typing import NDArray
 from ..common.errors import InputError
 from ..common.grid import Grid
 from ..common.parameter_groups import GridParameters, ModelParameters
-from ..common.readings import Readings
+from ..common.readings import Floats, Readings
 from ..runtime.jit import allocating_kernel, inlined_kernel, kernel
 from .cone import Cone, make_cone, rows_of, runs_of
 from .density import CUT
-
-Floats = NDArray[np.float64]
-
 
 _FIELDS = ('x', 'y', 'axis_x', 'axis_y', 'sine', 'cosine', 'z', 'z_max', 'sigma', 'free', 'reach')
 

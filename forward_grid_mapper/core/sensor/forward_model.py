@@ -19,10 +19,10 @@ from numpy.typing import NDArray
 
 from ..common.grid import Grid
 from ..common.parameter_groups import ModelParameters
-from ..common.readings import Readings
+from ..common.readings import Floats, Readings
 from ..runtime.jit import allocating_kernel, inlined_kernel
 from .cone import rows_of, runs_of
-from .cone_table import Cones, Floats, cone_of, cone_table
+from .cone_table import Cones, cone_of, cone_table
 from .density import Causes, causes_of, density
 from .surface_normals import SurfaceNormals, exceeds_incidence_angle, no_normals
 

@@ -17,13 +17,14 @@ from typing import NamedTuple
 import numpy as np
 
 from ..common.errors import InputError
+from ..common.readings import Floats
 from .holding_out import LEAST_SIGMAS
 from .judging import gain_of_objective, gain_over_drive
 from .loops import Loop
 from .odometry_model import CALIBRATION, sensitivity
 from .passes import Progress
 from .pose_graph import solution_at
-from .poses import Floats, relative, rms_after_alignment
+from .poses import relative, rms_after_alignment
 from .relocating import LEAST_RECOGNISED, recognised_part
 from .scan_matching import TRUSTS, scan_matched
 from .scans import Scans

@@ -14,10 +14,9 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.sparse.linalg import splu
 
-Floats = NDArray[np.float64]
+from ..common.readings import Floats
 
 
 class Bordered:

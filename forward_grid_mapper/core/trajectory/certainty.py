@@ -25,11 +25,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..common.parameters import Parameters
-from ..common.readings import Readings
+from ..common.readings import Floats, Readings
 from .holding_out import blocks_of, held_out, predicted
 from .local_map import for_matching
 from .odometry_model import CALIBRATION, calibrated, with_yaw
-from .poses import Floats, wrapped
+from .poses import wrapped
 from .scans import Scans
 from .windows import Odometry, cut
 

@@ -13,11 +13,11 @@ from functools import cached_property
 
 import numpy as np
 
-from ..common.readings import Readings
+from ..common.readings import Floats, Readings
 from ..messages.odometry_record import hard_to_interpolate
 from .local_map import at_poses
 from .outcome import replaced
-from .poses import Floats, compose, inverse, relative
+from .poses import compose, inverse, relative
 from .windows import Odometry
 
 

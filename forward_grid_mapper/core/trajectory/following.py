@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..common.parameters import Parameters
-from ..common.readings import Readings, in_canonical_order
+from ..common.readings import Floats, Readings, in_canonical_order
 from ..messages.message_types import NANOSECONDS
 from ..messages.odometry_record import MOST_POSES
 from ..messages.thinning import kept
@@ -38,8 +38,8 @@ from .matching import climbed, grid_around, measure
 from .odometry_model import CALIBRATION, Noise, calibrated, covariances, motions
 from .passes import BEHIND, BLOCK
 from .pose_graph import Edges, Graph, Yaws, joined, no_edges, no_walls, solve
-from .poses import Floats, compose, relative
-from .refinement import SHORTEST
+from .poses import compose, relative
+from .refinable import SHORTEST
 from .scans import FEWEST_ON_MAP, Scans
 from .solving import LEAST_YAW, NOISE_FACTOR
 from .tail import Tail, continued, edges_from, from_step, window_coordinate

@@ -26,8 +26,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from ..common.readings import Floats
 from .hidden_markov import forward, smooth
-from .poses import Floats
 from .walls import DIRECTIONS, votes_for
 from .windows import Windows
 

@@ -10,8 +10,8 @@ from typing import Any
 
 import numpy as np
 
+from ..common.readings import Floats
 from ..runtime.jit import inlined_kernel, kernel
-from .poses import Floats
 
 TINY = 1e-300
 """Smallest probability of a state, so that later votes can still raise it."""

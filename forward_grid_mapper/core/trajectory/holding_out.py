@@ -15,8 +15,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from ..common.readings import Floats
 from .likelihood import scores
-from .poses import Floats, relative
+from .poses import relative
 from .scans import Scans
 
 EVERY = 8

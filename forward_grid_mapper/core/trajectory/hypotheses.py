@@ -12,12 +12,12 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 
+from ..common.readings import Floats
 from .heading import Heading
 from .holding_out import LEAST_SIGMAS, blocks_of, gain, predicted
 from .loops import APART, Loop
 from .passes import BLOCK
 from .pose_graph import Solution
-from .poses import Floats
 from .relocating import confirmed
 from .scans import Scans
 from .solving import Solver

@@ -11,9 +11,10 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
+from ..common.readings import Floats
 from .holding_out import FEWEST_BLOCKS, LEAST_SIGMAS, Gain, blocks_of, gain, held_out_blocks, predicted
 from .passes import BLOCK, Progress
-from .poses import Floats, wrapped
+from .poses import wrapped
 from .scans import Scans
 from .windows import Windows
 

@@ -18,7 +18,7 @@ from .holding_out import LEAST_SIGMAS, Gain, gain, held_out, held_out_blocks, pr
 from .judging import HELD_OUT
 from .local_map import for_matching
 from .outcome import Refinement, differences, replaced
-from .refinement import without_times
+from .refinable import without_times
 from .scans import Scans
 from .windows import Odometry, cut
 

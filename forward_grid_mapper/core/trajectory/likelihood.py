@@ -21,12 +21,11 @@ from numpy.typing import NDArray
 
 from ..common.constants import THROUGH
 from ..common.parameter_groups import ModelParameters
-from ..common.readings import Readings
+from ..common.readings import Floats, Readings
 from ..runtime.jit import inlined_kernel, kernel
 from ..sensor.cone_table import effective_sigma, reach_of
 from ..sensor.density import CUT, causes_of, density
 from .local_map import LocalMap
-from .poses import Floats
 
 RAYS = (3, 5, 7, 11)
 """Numbers of rays through a cone, the middle one along its axis: as many as needed to be at most a cell apart, 11 at

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from ..common.grid import Grid
 from ..common.parameter_groups import ModelParameters
 from ..common.parameters import Parameters
-from ..common.readings import Readings
+from ..common.readings import Floats, Readings
 from ..evidence.evidence import Evidence
 from ..evidence.learned_normals import NO_INCIDENCE_LIMIT
 from ..maps.traversed import traversed_cells
@@ -24,7 +24,6 @@ from ..runtime.memory import memory_for_pairs
 from ..search.search import Search, SearchResult
 from ..sensor.cone_table import grid_of
 from ..sensor.density import hit_probability
-from .poses import Floats
 
 OCCUPIED, FREE = 1 / (1 + math.exp(-3.0)), 1 / (1 + math.exp(4.0))
 """Probabilities of occupied and of free cells of a local map."""

@@ -16,10 +16,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from ..common.readings import Floats
 from .local_map import LocalMap
 from .matching import climbed, measure
 from .passes import FEWEST, Matches, Progress
-from .poses import Floats, axes_at, compose, relative, wrapped
+from .poses import axes_at, compose, relative, wrapped
 from .scans import FEWEST_ON_MAP, Scans
 from .searching import search
 

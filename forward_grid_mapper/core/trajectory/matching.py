@@ -16,9 +16,10 @@ from typing import NamedTuple
 
 import numpy as np
 
+from ..common.readings import Floats
 from .likelihood import Scan, scores
 from .local_map import LocalMap
-from .poses import Floats, compose
+from .poses import compose
 
 CURVED = np.array([0.06, 0.06, math.radians(1.5)])
 """s: steps between the 27 poses; metres along x and y of the map, and radians."""

@@ -14,7 +14,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from .poses import Floats, relative, wrapped
+from ..common.readings import Floats
+from .poses import relative, wrapped
 from .windows import Odometry, Windows
 
 CALIBRATION = ('scale', 'heading', 'bias', 'turn_scale')

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ..common.readings import Readings
-from .jumps import UNKNOWN, Begin, Part, jump_words
+from .after_jumps import UNKNOWN, Begin, Part, jump_words
 from .local_map import at_poses
 from .poses import compose, relative, rms_after_alignment
 from .registration import moved_to

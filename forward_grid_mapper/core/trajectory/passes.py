@@ -7,9 +7,10 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
+from ..common.readings import Floats
 from .matching import Match, measure
 from .pose_graph import Edges, no_edges
-from .poses import Floats, relative, rms_after_alignment
+from .poses import relative, rms_after_alignment
 from .scans import Scans
 
 BLOCK = 4

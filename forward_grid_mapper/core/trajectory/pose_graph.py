@@ -24,8 +24,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import sparse
 
+from ..common.readings import Floats
 from .bordered import Bordered
-from .poses import Floats, relative, wrapped
+from .poses import relative, wrapped
 
 ROBUST = 4.0
 """k of Cauchy's loss for matches, σ: larger residuals count less and less."""

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-Floats = NDArray[np.float64]
+from ..common.readings import Floats
 
 
 def wrapped(angle: Any) -> Any:

@@ -7,8 +7,8 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from ..common.readings import Readings
-from .poses import Floats, compose, inverse, wrapped
+from ..common.readings import Floats, Readings
+from .poses import compose, inverse, wrapped
 from .windows import Odometry
 
 ELSEWHERE = 0.1

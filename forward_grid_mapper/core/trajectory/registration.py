@@ -15,14 +15,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..common.parameters import Parameters
-from ..common.readings import Readings
+from ..common.readings import Floats, Readings
 from ..messages.reading_buffer import bounded
 from ..sensor.density import hit_probability
 from .holding_out import LEAST_SIGMAS, Gain, gain
 from .likelihood import Scan, make_scan, scores
 from .local_map import UNKNOWN, LocalMap, at_poses, for_matching, local_map
 from .matching import grid_around
-from .poses import Floats, compose, relative
+from .poses import compose, relative
 
 SIGMA = np.array([0.1, 0.1, math.radians(4.0)])
 """σ of the prior of the begin: metres, metres, radians."""

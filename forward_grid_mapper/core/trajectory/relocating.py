@@ -14,12 +14,13 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from ..common.readings import Floats
 from .likelihood import Scan, scores
 from .local_map import LocalMap
 from .loops import APART, LENGTH, SHARED, Loop, Places, find_loop
 from .loops import REACH as LOOP_REACH
 from .matching import grid_around
-from .poses import Floats, compose, relative
+from .poses import compose, relative
 from .scans import FEWEST_ON_MAP, Scans
 
 NEAR = 2.0

@@ -13,10 +13,11 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from ..common.readings import Floats
 from .likelihood import scores
 from .matching import grid_around
 from .passes import FEWEST, Progress
-from .poses import Floats, compose, relative
+from .poses import compose, relative
 from .scans import Scans
 
 BLOCK = 2

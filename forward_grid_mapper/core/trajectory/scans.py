@@ -9,11 +9,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..common.parameters import Parameters
-from ..common.readings import Readings
+from ..common.readings import Floats, Readings
 from ..sensor.density import hit_probability
 from .likelihood import Scan, make_scan
 from .local_map import UNKNOWN, LocalMap, at_poses, explained, local_map
-from .poses import Floats, compose, relative
+from .poses import compose, relative
 from .windows import Windows, corrected
 
 FEWEST_ON_MAP = 30

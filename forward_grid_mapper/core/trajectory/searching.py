@@ -14,10 +14,11 @@ from typing import NamedTuple
 
 import numpy as np
 
+from ..common.readings import Floats
 from .likelihood import Scan, blurred, scores
 from .local_map import LocalMap
 from .matching import grid_around
-from .poses import Floats, compose, relative
+from .poses import compose, relative
 
 STEPS = (0.15, 0.15, math.radians(2.5))
 """Steps of the finest grid: metres ahead and aside, radians."""

@@ -12,6 +12,7 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
+from ..common.readings import Floats
 from .heading import Heading
 from .holding_out import LEAST_SIGMAS, gain, predicted
 from .loops import Loop, SearchResults, find_loops, loops_of
@@ -27,7 +28,7 @@ from .odometry_model import (
 )
 from .passes import BLOCK, Matches, Progress, deformation, match_preceding, match_surrounding
 from .pose_graph import Edges, Graph, Solution, Walls, Yaws, joined, no_edges, no_walls, no_yaws, solve
-from .poses import Floats, rms_after_alignment
+from .poses import rms_after_alignment
 from .relocating import MORE_RECOGNISED, displaced, loops_at, recognised, revisits, unsupported, windows_of
 from .scans import Scans
 from .wall_distances import Distances

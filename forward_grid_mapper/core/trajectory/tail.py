@@ -6,9 +6,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ..common.readings import Readings
+from ..common.readings import Floats, Readings
 from .pose_graph import Edges
-from .poses import Floats, axes_at, compose, interpolated
+from .poses import axes_at, compose, interpolated
 from .windows import TRAVEL, TURN, Odometry
 
 ROUNDING = 1e-6

@@ -13,8 +13,9 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
+from ..common.readings import Floats
 from .pose_graph import Walls
-from .poses import Floats, compose, wrapped
+from .poses import compose, wrapped
 from .walls import beside
 from .windows import Windows
 

@@ -31,8 +31,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ..common.readings import Floats
 from ..runtime.jit import kernel
-from .poses import Floats, compose, relative
+from .poses import compose, relative
 from .windows import Windows
 
 DIRECTIONS = 90

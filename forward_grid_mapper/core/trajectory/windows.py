@@ -15,9 +15,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ..common.readings import Readings
+from ..common.readings import Floats, Readings
 from ..runtime.jit import kernel
-from .poses import Floats, compose, interpolated, relative
+from .poses import compose, interpolated, relative
 
 TRAVEL = 0.4
 """Metres of a window in which the robot does not turn."""

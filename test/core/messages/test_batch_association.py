@@ -18,11 +18,11 @@ from forward_grid_mapper.core.common.readings import Readings
 from forward_grid_mapper.core.messages.batch_association import BatchAssociator
 from forward_grid_mapper.core.messages.extrinsics import STEEP, Mount
 from forward_grid_mapper.core.messages.limit_watch import LimitWatch
-from forward_grid_mapper.core.messages.message_account import MOST_FRAMES
 from forward_grid_mapper.core.messages.message_batch import batch_of
 from forward_grid_mapper.core.messages.message_types import NANOSECONDS, OdometryMessage, Pose2, RangeMessage
 from forward_grid_mapper.core.messages.pose_association import PoseAssociator
 from forward_grid_mapper.core.messages.rep117 import measure, measure_all
+from forward_grid_mapper.core.messages.sensor_records import MOST_FRAMES
 
 Message = RangeMessage | OdometryMessage
 

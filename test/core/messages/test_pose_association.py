@@ -12,11 +12,11 @@ from hypothesis import strategies as st
 
 from forward_grid_mapper.core.common.parameters import Parameters
 from forward_grid_mapper.core.messages.extrinsics import LATER, Later
-from forward_grid_mapper.core.messages.message_account import MOST_FRAMES
 from forward_grid_mapper.core.messages.message_types import NANOSECONDS, OdometryMessage, Pose2, RangeMessage
 from forward_grid_mapper.core.messages.pose_association import PoseAssociator
 from forward_grid_mapper.core.messages.pose_history import HISTORY
 from forward_grid_mapper.core.messages.rep117 import REASONS, measure
+from forward_grid_mapper.core.messages.sensor_records import MOST_FRAMES
 
 INF, NAN = math.inf, math.nan
 SENSOR = Pose2(0.2, 0.1, math.pi / 2)

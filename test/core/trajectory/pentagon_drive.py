@@ -9,9 +9,9 @@ from functools import lru_cache
 import numpy as np
 
 from forward_grid_mapper.core.common.parameters import Parameters
+from forward_grid_mapper.core.common.readings import Floats
 from forward_grid_mapper.core.trajectory.holding_out import held_out
 from forward_grid_mapper.core.trajectory.local_map import for_matching
-from forward_grid_mapper.core.trajectory.poses import Floats
 from forward_grid_mapper.core.trajectory.scans import Scans
 from forward_grid_mapper.core.trajectory.windows import Odometry, cut
 from forward_grid_mapper.simulation.drift import LEVELS, odometry_of, with_drift

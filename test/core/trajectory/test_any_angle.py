@@ -9,12 +9,13 @@ import pytest
 from pentagon_drive import quietly
 
 from forward_grid_mapper.core.common.errors import InputError
+from forward_grid_mapper.core.common.readings import Floats
 from forward_grid_mapper.core.trajectory import any_angle, scan_matching
 from forward_grid_mapper.core.trajectory import scans as scans_module
 from forward_grid_mapper.core.trajectory.holding_out import Gain
 from forward_grid_mapper.core.trajectory.odometry_model import CALIBRATION
 from forward_grid_mapper.core.trajectory.pose_graph import Solution, solution_at
-from forward_grid_mapper.core.trajectory.poses import Floats, relative
+from forward_grid_mapper.core.trajectory.poses import relative
 from forward_grid_mapper.core.trajectory.scan_matching import TRUSTS
 from forward_grid_mapper.core.trajectory.scans import Scans
 from forward_grid_mapper.simulation.drift import odometry_of

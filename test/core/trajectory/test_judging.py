@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from forward_grid_mapper.core.common.readings import Floats
 from forward_grid_mapper.core.trajectory import judging
 from forward_grid_mapper.core.trajectory.holding_out import EVERY, FEWEST_BLOCKS, gain, held_out
 from forward_grid_mapper.core.trajectory.judging import CLEAR, FIRST, HELD_OUT, JUDGED_ON, gain_over_drive
 from forward_grid_mapper.core.trajectory.passes import BLOCK
-from forward_grid_mapper.core.trajectory.poses import Floats
 from forward_grid_mapper.core.trajectory.scans import Scans
 
 WINDOWS = EVERY * HELD_OUT

@@ -10,7 +10,7 @@ import pytest
 from forward_grid_mapper.core.common.errors import Cancelled
 from forward_grid_mapper.core.common.parameters import Parameters
 from forward_grid_mapper.core.common.readings import Readings
-from forward_grid_mapper.core.trajectory import jumps as jumping
+from forward_grid_mapper.core.trajectory import after_jumps
 from forward_grid_mapper.core.trajectory.correction import Correction
 from forward_grid_mapper.core.trajectory.following import Follower
 from forward_grid_mapper.core.trajectory.jumps import doubtful_steps, jumps, since_jump, without_outliers
@@ -118,11 +118,11 @@ def test_drive_with_few_poses_is_refined(exact: Recording, bent: tuple[Readings,
 
 def test_doubtful_step_longer_than_the_examined_path_is_no_jump(bent: tuple[Readings, Odometry]) -> None:
     readings, _ = bent
-    pose = np.array([[0.0, 0.0, 0.0], [jumping.LOOKED_BACK + 5.0, 0.0, 0.0]])
+    pose = np.array([[0.0, 0.0, 0.0], [after_jumps.LOOKED_BACK + 5.0, 0.0, 0.0]])
     odometry = Odometry.of(readings.stamp.min() + np.array([0, 10_000_000_000]), pose)
     jumped_to = jumps(odometry)
     assert doubtful_steps(odometry).tolist() == [1]
-    found = jumping.with_doubtful(readings, odometry, jumped_to, Parameters(), np.zeros(1, np.uint8))
+    found = after_jumps.with_doubtful(readings, odometry, jumped_to, Parameters(), np.zeros(1, np.uint8))
     assert found.tolist() == jumped_to.tolist() == []
 
 
@@ -132,14 +132,14 @@ def test_doubtful_step_is_judged_by_readings_up_to_the_next_jump(monkeypatch: py
     class Check:
         """Records the poses of the part after the step, and finds that it does not fit."""
 
-        def __init__(self, part: jumping.Part, parameters: Parameters, stop: np.ndarray) -> None:
+        def __init__(self, part: after_jumps.Part, parameters: Parameters, stop: np.ndarray) -> None:
             judged.append((len(part.odometry.stamp), len(part.readings)))
 
         def fits(self, around: object, begin: np.ndarray, least: float) -> bool:
             return False
 
-    monkeypatch.setattr(jumping, '_FitCheck', Check)
-    monkeypatch.setattr(jumping, 'OnMap', lambda *arguments: None)
+    monkeypatch.setattr(after_jumps, '_FitCheck', Check)
+    monkeypatch.setattr(after_jumps, 'OnMap', lambda *arguments: None)
     # 0.01 m and 0.1 s between two poses; a turn that is too fast at 200, and jumps at 350 and 500
     pose = np.zeros((700, 3))
     pose[:, 0] = 0.01 * np.arange(700)
@@ -151,7 +151,7 @@ def test_doubtful_step_is_judged_by_readings_up_to_the_next_jump(monkeypatch: py
     ranges = Readings.from_columns(
         ('sonar',), x=pose[:, 0], y=0.0, yaw=0.0, z=np.ones(700), z_max=5.0, half_angle=0.1, stamp=odometry.stamp
     )
-    jumping.with_doubtful(ranges, odometry, jumps(odometry), Parameters(), np.zeros(1, np.uint8))
+    after_jumps.with_doubtful(ranges, odometry, jumps(odometry), Parameters(), np.zeros(1, np.uint8))
     assert judged == [(150, 150)]
 
 
@@ -160,12 +160,12 @@ def test_part_without_readings_at_its_begin_is_not_placed(bent: tuple[Readings, 
     readings, odometry = bent
     half = len(odometry.stamp) // 2
     paths = [Odometry(odometry.stamp[part], odometry.pose[part]) for part in (slice(half), slice(half, None))]
-    far = paths[1].travel > jumping.OWN_MAP
+    far = paths[1].travel > after_jumps.OWN_MAP
     begin = readings.stamp < paths[1].stamp[0], readings.stamp > paths[1].stamp[far][0]
-    parts = [jumping.Part(readings.select(w), path, path, False) for w, path in zip(begin, paths, strict=True)]
-    assert len(parts[1].readings) >= jumping.FEWEST_READINGS
-    found = jumping.begins_of(parts, Parameters(), np.zeros(1, np.uint8))
-    assert [each.how for each in found] == [jumping.FIRST, jumping.UNKNOWN]
+    parts = [after_jumps.Part(readings.select(w), path, path, False) for w, path in zip(begin, paths, strict=True)]
+    assert len(parts[1].readings) >= after_jumps.FEWEST_READINGS
+    found = after_jumps.begins_of(parts, Parameters(), np.zeros(1, np.uint8))
+    assert [each.how for each in found] == [after_jumps.FIRST, after_jumps.UNKNOWN]
 
 
 def test_drive_without_jumps_has_no_jumps(bent: tuple[Readings, Odometry]) -> None:
@@ -306,9 +306,9 @@ def test_turn_is_a_jump_only_if_readings_fit_only_the_pose_before(
     x, y, yaw = odometry.pose[first].tolist()
     readings, odometry = restarted(readings, odometry, 0.5, (x, y, yaw + 1.2))
     where = {tuple(before.tolist()): stood, tuple(odometry.pose[first].tolist()): turned}
-    monkeypatch.setattr(jumping._FitCheck, 'fits', lambda self, around, begin, least: where[tuple(begin.tolist())])
+    monkeypatch.setattr(after_jumps._FitCheck, 'fits', lambda self, around, begin, least: where[tuple(begin.tolist())])
     nothing, stop = np.zeros(0, np.int64), np.zeros(1, np.uint8)
-    found = jumping.with_doubtful(readings, odometry, nothing, Parameters(), stop)
+    found = after_jumps.with_doubtful(readings, odometry, nothing, Parameters(), stop)
     assert found.tolist() == ([first] if stood and not turned else [])
 
 
@@ -376,13 +376,13 @@ def test_placing_of_parts_can_be_cancelled(bent: tuple[Readings, Odometry], monk
     monkeypatch.setattr(
         refiner, '_whole', lambda readings, odometry, least: Refinement(False, '', readings, odometry, {})
     )
-    place = jumping.OnMap
+    place = after_jumps.OnMap
 
     def cancels(*arguments: object) -> object:
         refiner.cancel()
         return place(*arguments)
 
-    monkeypatch.setattr(jumping, 'OnMap', cancels)
+    monkeypatch.setattr(after_jumps, 'OnMap', cancels)
     with pytest.raises(Cancelled):
         refiner.run(*restarted(*bent, 0.5))
 

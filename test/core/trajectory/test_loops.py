@@ -9,13 +9,14 @@ import pytest
 from exact_tour import quietly, tour_with
 
 from forward_grid_mapper.core.common.parameters import Parameters
+from forward_grid_mapper.core.common.readings import Floats
 from forward_grid_mapper.core.trajectory import loops
 from forward_grid_mapper.core.trajectory.local_map import for_matching
 from forward_grid_mapper.core.trajectory.loops import AROUND, LENGTH, Loop, Places, find_loop, find_loops, loops_of
 from forward_grid_mapper.core.trajectory.matching import Match
 from forward_grid_mapper.core.trajectory.passes import Matches, match_preceding
 from forward_grid_mapper.core.trajectory.pose_graph import residuals
-from forward_grid_mapper.core.trajectory.poses import Floats, compose, relative
+from forward_grid_mapper.core.trajectory.poses import compose, relative
 from forward_grid_mapper.core.trajectory.scans import Scans
 from forward_grid_mapper.core.trajectory.solving import Solver
 from forward_grid_mapper.core.trajectory.windows import Odometry, cut

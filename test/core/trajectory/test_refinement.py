@@ -13,7 +13,8 @@ from forward_grid_mapper.core.common.errors import Cancelled
 from forward_grid_mapper.core.common.parameters import Parameters
 from forward_grid_mapper.core.common.readings import Readings
 from forward_grid_mapper.core.mapping import Mapper
-from forward_grid_mapper.core.trajectory import refinement
+from forward_grid_mapper.core.trajectory import refinement, right_angles
+from forward_grid_mapper.core.trajectory.attempt import gain_words
 from forward_grid_mapper.core.trajectory.heading import NOISES, Drifts, Heading
 from forward_grid_mapper.core.trajectory.holding_out import (
     FEWEST_BLOCKS,
@@ -27,7 +28,8 @@ from forward_grid_mapper.core.trajectory.holding_out import (
 from forward_grid_mapper.core.trajectory.hypotheses import Solved
 from forward_grid_mapper.core.trajectory.outcome import Refinement
 from forward_grid_mapper.core.trajectory.poses import compose, relative, rms_after_alignment
-from forward_grid_mapper.core.trajectory.refinement import Refiner, _gain_words, unfit
+from forward_grid_mapper.core.trajectory.refinable import unfit
+from forward_grid_mapper.core.trajectory.refinement import Refiner
 from forward_grid_mapper.core.trajectory.scans import Scans
 from forward_grid_mapper.core.trajectory.windows import Odometry, cut
 from forward_grid_mapper.simulation.drift import LEVELS, odometry_of, with_drift
@@ -64,9 +66,9 @@ def outcome(bent, stages) -> Refinement:
 def test_unknown_gain_is_reported_without_a_number() -> None:
     """For example one sweep each metre, with too few readings in each block."""
     nothing = np.full(20, np.nan)
-    assert 'too few readings' in _gain_words(gain(nothing, nothing))
+    assert 'too few readings' in gain_words(gain(nothing, nothing))
     rng = np.random.default_rng(0)
-    assert '± 0.' in _gain_words(gain(rng.random(20), rng.random(20)))
+    assert '± 0.' in gain_words(gain(rng.random(20), rng.random(20)))
 
 
 def test_drift_is_corrected(tour, bent, outcome, stages) -> None:
@@ -86,22 +88,23 @@ def test_drift_is_corrected(tour, bent, outcome, stages) -> None:
 def test_reason_of_acceptance_is_named(bent, monkeypatch, outcome) -> None:
     assert outcome.reason.startswith(('readings are predicted', 'with walls at right angles'))
     # at this limit the gain of predicted readings does not suffice, and no place was seen twice, so walls decide
-    monkeypatch.setattr(refinement, 'LEAST_SIGMAS', 1e9)
-    monkeypatch.setattr(refinement, 'has_revisits', lambda *rest: False)
+    for module in (right_angles, refinement):
+        monkeypatch.setattr(module, 'LEAST_SIGMAS', 1e9)
+    monkeypatch.setattr(right_angles, 'has_revisits', lambda *rest: False)
     assert 'with walls at right angles, the readings are more likely by' in Refiner(Parameters()).run(*bent).reason
 
 
 @pytest.fixture
 def solved_once(monkeypatch) -> None:
     """Solve only once: runs with other judgements need not repeat it."""
-    solve, found = refinement.solve_hypotheses, []
+    solve, found = right_angles.solve_hypotheses, []
 
     def once(*rest) -> Solved:
         if not found:
             found.append(solve(*rest))
         return found[0]
 
-    monkeypatch.setattr(refinement, 'solve_hypotheses', once)
+    monkeypatch.setattr(right_angles, 'solve_hypotheses', once)
 
 
 def no_matches(*rest) -> None:
@@ -111,15 +114,15 @@ def no_matches(*rest) -> None:
 def test_recognised_places_prove_what_nearby_readings_do_not(tour, bent, monkeypatch, solved_once) -> None:
     # wheels that are right over metres predict nearby readings better than yaws from walls do
     monkeypatch.setattr(refinement, 'match_drive', no_matches)
-    monkeypatch.setattr(refinement, 'gain_over_drive', lambda *rest: Gain(-0.05, 0.01))
+    monkeypatch.setattr(right_angles, 'gain_over_drive', lambda *rest: Gain(-0.05, 0.01))
     found, true = Refiner(Parameters()).run(*bent), odometry_of(tour).pose
     assert found.accepted
     assert found.reason.startswith('with recognised places, readings are predicted better than')
     assert rms_after_alignment(found.trajectory.pose, true) < 0.2
     # the same without such places, and without walls that contradict the yaw
-    monkeypatch.setattr(refinement, 'gain_at_revisits', lambda *rest: Gain(0.0, 0.01))
+    monkeypatch.setattr(right_angles, 'gain_at_revisits', lambda *rest: Gain(0.0, 0.01))
     left = Refiner(Parameters()).run(*bent)
-    monkeypatch.setattr(refinement, 'LEAST_VOTE_GAIN', 1e9)
+    monkeypatch.setattr(right_angles, 'LEAST_VOTE_GAIN', 1e9)
     for outcome in (left, Refiner(Parameters()).run(*bent)):
         assert not outcome.accepted
         assert 'does not show that odometry is wrong' in outcome.reason
@@ -128,18 +131,18 @@ def test_recognised_places_prove_what_nearby_readings_do_not(tour, bent, monkeyp
 def test_walls_are_no_proof_if_recognised_places_do_not_confirm(bent, monkeypatch, solved_once) -> None:
     # walls that are not parallel give a wrong yaw, and readings are predicted about as well
     monkeypatch.setattr(refinement, 'match_drive', no_matches)
-    monkeypatch.setattr(refinement, 'gain_over_drive', lambda *rest: Gain(0.001, 0.01))
-    monkeypatch.setattr(refinement, 'gain_at_revisits', lambda *rest: Gain(0.001, 0.01))
+    monkeypatch.setattr(right_angles, 'gain_over_drive', lambda *rest: Gain(0.001, 0.01))
+    monkeypatch.setattr(right_angles, 'gain_at_revisits', lambda *rest: Gain(0.001, 0.01))
     left = Refiner(Parameters()).run(*bent)
     assert not left.accepted
     assert left.reason.startswith('with recognised places, readings are predicted better than')
     assert 'does not show that odometry is wrong' in left.reason
     # if the robot visited no place twice, walls are proof, unless readings are predicted worse
-    monkeypatch.setattr(refinement, 'has_revisits', lambda *rest: False)
+    monkeypatch.setattr(right_angles, 'has_revisits', lambda *rest: False)
     found = Refiner(Parameters()).run(*bent)
     assert found.accepted
     assert found.reason.startswith('with walls at right angles, the readings are more likely')
-    monkeypatch.setattr(refinement, 'gain_at_revisits', lambda *rest: Gain(-0.02, 0.01))
+    monkeypatch.setattr(right_angles, 'gain_at_revisits', lambda *rest: Gain(-0.02, 0.01))
     worse = Refiner(Parameters()).run(*bent)
     assert not worse.accepted
     assert worse.reason.startswith('readings are predicted worse than')
@@ -284,11 +287,11 @@ def test_noise_of_odometry_is_estimated_or_given(bent, monkeypatch) -> None:
     def look(windows, at, votes, noises) -> None:
         seen.append(noises)
 
-    monkeypatch.setattr(refinement, 'heading', look)
-    windows = cut(*bent)
-    scans = Scans(windows, Parameters(), np.zeros(1, np.uint8), held_out(len(windows)))
+    monkeypatch.setattr(right_angles, 'heading', look)
+    monkeypatch.setattr(refinement, 'match_drive', no_matches)
     for given in ({}, {'odometry_noise': 0.04}):
-        assert Refiner(Parameters.from_flat(given))._heading(windows, scans) == (None, 0.0)
+        found = Refiner(Parameters.from_flat(given)).run(*bent)
+        assert found.reason.startswith(right_angles.NO_WALLS)
     assert seen == [NOISES, (0.04,)]
 
 
@@ -298,7 +301,7 @@ def test_votes_due_to_the_layout_of_sensors_are_no_evidence(bent, monkeypatch, b
     nothing = np.zeros(0)
     found = Heading(nothing.astype(int), nothing, nothing, nothing, Drifts(0.0, 0.0, 0.02), 1.0, 1.0, 50.0, nothing)
     answers = [found, None if by_chance is None else replace(found, over_odometry=by_chance)]
-    monkeypatch.setattr(refinement, 'heading', lambda *rest: answers.pop(0))
-    refiner, windows = Refiner(Parameters()), cut(readings, odometry)
+    monkeypatch.setattr(right_angles, 'heading', lambda *rest: answers.pop(0))
+    windows = cut(readings, odometry)
     scans = Scans(windows, Parameters(), np.zeros(1, np.uint8), held_out(len(windows)))
-    assert refiner._heading(windows, scans) == (found, evidence)
+    assert right_angles.heading_of_walls(windows, scans, 0.0) == (found, evidence)

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from exact_tour import Tour, quietly, tour_with
 
+from forward_grid_mapper.core.common.readings import Floats
 from forward_grid_mapper.core.trajectory import hypotheses, solving
 from forward_grid_mapper.core.trajectory.heading import DOUBTFUL, Heading, doubts, slight
 from forward_grid_mapper.core.trajectory.holding_out import Gain
@@ -18,7 +19,7 @@ from forward_grid_mapper.core.trajectory.loops import APART, LENGTH, Loop
 from forward_grid_mapper.core.trajectory.matching import Match
 from forward_grid_mapper.core.trajectory.passes import Matches, match_preceding
 from forward_grid_mapper.core.trajectory.pose_graph import solution_at
-from forward_grid_mapper.core.trajectory.poses import Floats, compose, relative
+from forward_grid_mapper.core.trajectory.poses import compose, relative
 from forward_grid_mapper.core.trajectory.relocating import (
     CONFIRMING,
     FEW,

@@ -11,16 +11,18 @@ from pentagon_drive import quietly
 
 from forward_grid_mapper.core.common.errors import Cancelled
 from forward_grid_mapper.core.common.parameters import Parameters
+from forward_grid_mapper.core.common.readings import Floats
 from forward_grid_mapper.core.mapping import Mapper
-from forward_grid_mapper.core.trajectory import any_angle, refinement, scan_matching
+from forward_grid_mapper.core.trajectory import any_angle, refinement, right_angles, scan_matching
 from forward_grid_mapper.core.trajectory.any_angle import MatchedDrive
+from forward_grid_mapper.core.trajectory.attempt import Attempt, Drive
 from forward_grid_mapper.core.trajectory.holding_out import Gain, held_out
 from forward_grid_mapper.core.trajectory.judging import gain_of_objective, gain_over_drive, turns_supported
 from forward_grid_mapper.core.trajectory.likelihood import scores
 from forward_grid_mapper.core.trajectory.local_map import for_matching
 from forward_grid_mapper.core.trajectory.outcome import Refinement
-from forward_grid_mapper.core.trajectory.poses import Floats, compose, relative, rms_after_alignment
-from forward_grid_mapper.core.trajectory.refinement import Refiner, _Attempt, _Drive
+from forward_grid_mapper.core.trajectory.poses import compose, relative, rms_after_alignment
+from forward_grid_mapper.core.trajectory.refinement import Refiner
 from forward_grid_mapper.core.trajectory.relocating import LEAST_RECOGNISED
 from forward_grid_mapper.core.trajectory.scan_matching import BLOCK, FIRST, TRUSTS, scan_matched
 from forward_grid_mapper.core.trajectory.scans import Scans
@@ -130,23 +132,23 @@ def test_exact_odometry_without_right_angles_is_kept(exact) -> None:
     assert outcome.readings is exact.readings
 
 
-def no_walls(self, windows, scans) -> tuple[None, float]:
+def no_walls(windows, scans, odometry_noise) -> tuple[None, float]:
     return None, 0.0
 
 
 def test_trajectory_not_supported_by_readings_is_rejected(bent, matched, monkeypatch) -> None:
     recording, odometry = bent
-    monkeypatch.setattr(Refiner, '_heading', no_walls)
+    monkeypatch.setattr(right_angles, 'heading_of_walls', no_walls)
     monkeypatch.setattr(refinement, 'match_drive', lambda *rest: MatchedDrive(matched, [], np.inf, 1.0))
     monkeypatch.setattr(refinement, 'gain_at_revisits', lambda *rest: Gain(0.02, 0.01))
     left = Refiner(Parameters()).run(recording.readings, odometry)
     assert not left.accepted and left.trajectory is odometry
-    assert left.reason == refinement.NO_WALLS + refinement.NOR_MATCHES
+    assert left.reason == right_angles.NO_WALLS + refinement.NOR_MATCHES
 
 
 def test_matching_alone_is_not_tried_with_sparse_poses(bent, matched, monkeypatch) -> None:
     recording, odometry = bent
-    monkeypatch.setattr(Refiner, '_heading', no_walls)
+    monkeypatch.setattr(right_angles, 'heading_of_walls', no_walls)
     monkeypatch.setattr(refinement, 'match_drive', lambda *rest: MatchedDrive(matched, [], np.inf, 1.0))
     monkeypatch.setattr(refinement, 'gain_at_revisits', lambda *rest: Gain(0.1, 0.01))
     assert Refiner(Parameters()).run(recording.readings, odometry).accepted
@@ -156,7 +158,7 @@ def test_matching_alone_is_not_tried_with_sparse_poses(bent, matched, monkeypatc
     assert refinement.usual_step(sparse) == pytest.approx(1.0, abs=0.05)
     left = Refiner(Parameters()).run(recording.readings, sparse)
     assert not left.accepted
-    assert left.reason == refinement.NO_WALLS + refinement.too_sparse_words(refinement.usual_step(sparse))
+    assert left.reason == right_angles.NO_WALLS + refinement.too_sparse_words(refinement.usual_step(sparse))
 
 
 def test_usual_step_is_weighted_by_distance() -> None:
@@ -168,7 +170,7 @@ def test_usual_step_is_weighted_by_distance() -> None:
 
 def test_drive_above_max_cells_keeps_the_trajectory_from_walls(bent, scans) -> None:
     recording, odometry = bent
-    drive_of = _Drive(recording.readings, odometry, scans.windows, scans)
+    drive_of = Drive(recording.readings, odometry, scans.windows, scans)
     attempt = by_walls(scans, recording, odometry)
     small = Scans(
         scans.windows, for_matching(Parameters.from_flat({'max_cells': 10_000})), np.zeros(1, np.uint8), scans.held_out
@@ -199,7 +201,7 @@ def test_reason_names_recognised_places_only_with_revisits(bent, scans, matched,
     told = MatchedDrive(matched, [], np.inf, 0.0)
     monkeypatch.setattr(refinement, 'match_drive', lambda *rest: told)
     monkeypatch.setattr(refinement, 'has_revisits', lambda *rest: again)
-    drive_of = _Drive(recording.readings, odometry, scans.windows, scans)
+    drive_of = Drive(recording.readings, odometry, scans.windows, scans)
     found = Refiner(Parameters())._at_any_angle(drive_of, by_walls(scans, recording, odometry), 0.15)
     assert not found.right_angles
     assert ('with recognised places' in found.reason) == again
@@ -212,10 +214,10 @@ def test_reason_names_recognised_places_only_with_revisits(bent, scans, matched,
     assert 'bent as a whole' not in found.reason
 
 
-def by_walls(scans: Scans, recording: Recording, odometry: Odometry) -> _Attempt:
+def by_walls(scans: Scans, recording: Recording, odometry: Odometry) -> Attempt:
     """A trajectory as from walls at right angles: odometry under another name."""
     found = Refinement(True, 'walls', recording.readings, odometry, {})
-    return _Attempt(found, scans.windows.node)
+    return Attempt(found, scans.windows.node)
 
 
 @pytest.mark.parametrize('sigmas', [5.0, 1.0, -5.0])
@@ -228,7 +230,7 @@ def test_matches_alone_replace_walls_only_with_a_much_larger_j(
     monkeypatch.setattr(refinement, 'gain_of_objective', lambda *rest: told.append(rest[1:]) or Gain(sigmas, 1.0))
     monkeypatch.setattr(refinement, 'match_drive', lambda *rest: MatchedDrive(matched, [], np.inf, 1.0))
     found = Refiner(Parameters())._at_any_angle(
-        _Drive(recording.readings, odometry, scans.windows, scans), attempt, 0.15
+        Drive(recording.readings, odometry, scans.windows, scans), attempt, 0.15
     )
     assert (found is attempt.refinement) == (sigmas < 2.3)
     ((before, after),) = told
@@ -287,7 +289,7 @@ def test_turns_missing_in_odometry_are_distinguished_from_drift(exact, bent, sca
 
 def test_scan_matching_can_be_cancelled(bent, monkeypatch) -> None:
     recording, odometry = bent
-    monkeypatch.setattr(Refiner, '_heading', no_walls)
+    monkeypatch.setattr(right_angles, 'heading_of_walls', no_walls)
     refiner, stages = Refiner(Parameters()), []
 
     def watch(stage: str, part: float) -> None:

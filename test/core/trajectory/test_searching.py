@@ -8,11 +8,12 @@ import numpy as np
 import pytest
 
 from forward_grid_mapper.core.common.parameters import Parameters
+from forward_grid_mapper.core.common.readings import Floats
 from forward_grid_mapper.core.trajectory import searching
 from forward_grid_mapper.core.trajectory.likelihood import Scan, blurred, make_scan, scores
 from forward_grid_mapper.core.trajectory.local_map import UNKNOWN, LocalMap, local_map
 from forward_grid_mapper.core.trajectory.matching import grid_around
-from forward_grid_mapper.core.trajectory.poses import Floats, compose, relative
+from forward_grid_mapper.core.trajectory.poses import compose, relative
 from forward_grid_mapper.core.trajectory.searching import (
     BLUR,
     COARSER,

@@ -9,8 +9,9 @@ import numpy as np
 import pytest
 from exact_tour import Tour, quietly, tour_with
 
+from forward_grid_mapper.core.common.readings import Floats
 from forward_grid_mapper.core.trajectory.heading import Heading
-from forward_grid_mapper.core.trajectory.poses import Floats, wrapped
+from forward_grid_mapper.core.trajectory.poses import wrapped
 from forward_grid_mapper.core.trajectory.scans import Scans
 from forward_grid_mapper.core.trajectory.solving import YAW_WEIGHT, Solver
 from forward_grid_mapper.core.trajectory.walls import SPAN

@@ -1,0 +1,55 @@
+"""Attempts at the trajectory of a drive by one method, and what the methods share."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from ..common.readings import Floats, Readings
+from .holding_out import Gain
+from .outcome import Refinement
+from .poses import compose, inverse
+from .scans import Scans
+from .windows import Odometry, Windows, corrected
+
+LEAST_MOVED = 0.15
+"""Least difference from odometry of an accepted trajectory, metres (rms): about the error of the trajectory itself."""
+
+
+class Drive(NamedTuple):
+    """A drive, its windows and their scans."""
+
+    readings: Readings
+    odometry: Odometry
+    windows: Windows
+    scans: Scans
+
+
+class Attempt(NamedTuple):
+    """The result by one method, its nodes, and whether it is so sure that no other method needs to be tried."""
+
+    refinement: Refinement
+    nodes: Floats
+    sure: bool = False
+
+
+def refined(odometry: Odometry, windows: Windows, nodes: Floats) -> Odometry:
+    """Return the trajectory: odometry corrected by nodes, moved so that its first pose is that of odometry."""
+    w = windows
+    pose = corrected(odometry.progress, odometry.pose, w.node_progress, w.node, nodes)
+    home = compose(odometry.pose[0], inverse(pose[0]))
+    pose = compose(home, pose)
+    pose[:, 2] = np.unwrap(pose[:, 2])
+    return Odometry(odometry.stamp, pose)
+
+
+def gain_words(better: Gain) -> str:
+    """Return the gain over odometry in words."""
+    if not np.isfinite(better.error):
+        return 'too few readings overlap with maps of other readings to compare the prediction with that of odometry'
+    better_or_worse = 'better' if better.mean >= 0 else 'worse'
+    return (
+        f'readings are predicted {better_or_worse} than with odometry, by {abs(better.mean):.3f} ± {better.error:.3f} '
+        f'nats a reading'
+    )

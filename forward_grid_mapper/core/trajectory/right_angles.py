@@ -1,0 +1,254 @@
+"""SLAM with walls at right angles to each other: the heading from walls, then matching, then the judgement."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+from functools import partial
+from typing import NamedTuple
+
+import numpy as np
+
+from ..common.readings import Floats
+from .attempt import LEAST_MOVED, Attempt, Drive, gain_words, refined
+from .heading import NOISES, Heading, heading
+from .holding_out import LEAST_SIGMAS, Gain, has_revisits
+from .hypotheses import Solved, solve_hypotheses
+from .judging import gain_at_revisits, gain_over_drive, last_not_worse, turns_supported
+from .loops import Loop
+from .odometry_model import CALIBRATION
+from .outcome import Refinement, differences, replaced
+from .passes import Progress
+from .pose_graph import Solution
+from .relocating import LEAST_RECOGNISED, recognised_part
+from .scans import Scans
+from .solving import Solver
+from .walls import wall_votes
+from .windows import Windows
+
+LEAST_VOTE_GAIN, LEAST_SIGMAS_WITH_WALLS = 10.0, -1.0
+"""If votes of walls are likelier by so many nats than with the yaw of odometry, beyond what random ranges give, and the
+robot came back to no place, the gain in predicting readings need only be so many standard errors: readings must not be
+predicted worse. Small drift hardly shows within a few metres."""
+
+LEAST_CERTAINTY = 0.9
+"""Least probability that no right angle of the heading was lost."""
+
+NOT_ENOUGH = ': this does not show that odometry is wrong'
+
+NO_WALLS = (
+    'the echoes do not agree on directions of walls: this needs walls at right angles to each other beside the robot, '
+    'and odometry with an accurate yaw over a few metres'
+)
+
+
+class _AlongWalls(NamedTuple):
+    """What walls at right angles give before anything is matched.
+
+    Attributes
+    ----------
+    heading : Heading
+    vote_gain : float
+        By how many nats votes of walls are likelier than with the yaw of odometry, beyond what random ranges give.
+    solver : Solver
+        Of this heading.
+    along : Solution
+        By odometry and straight walls.
+    calibration : dict
+        Of `along`.
+    simple : float64, shape (K, 3)
+        Nodes of odometry with only the heading and this calibration applied.
+    gain : Gain
+        That of `simple` over odometry.
+    """
+
+    heading: Heading
+    vote_gain: float
+    solver: Solver
+    along: Solution
+    calibration: dict[str, float]
+    simple: Floats
+    gain: Gain
+
+    @property
+    def proven(self) -> bool:
+        """Whether readings all over the drive are predicted better."""
+        return self.gain.sigmas >= LEAST_SIGMAS
+
+    @property
+    def votes_suffice(self) -> bool:
+        """Whether votes of walls are enough evidence, since readings are not predicted worse."""
+        return self.vote_gain > LEAST_VOTE_GAIN and self.gain.sigmas >= LEAST_SIGMAS_WITH_WALLS
+
+    @property
+    def verdict(self) -> _Verdict:
+        """The judgement by readings all over the drive."""
+        return _Verdict(self.proven, self.gain, gain_words(self.gain))
+
+
+class _Verdict(NamedTuple):
+    """Whether a trajectory is accepted in place of odometry, its gain over odometry, and the reason in words."""
+
+    accepted: bool
+    gain: Gain
+    words: str
+
+
+class _Candidate(NamedTuple):
+    """Nodes to be judged, shape (K, 3), the calibration, and the loop closures that they fulfil."""
+
+    nodes: Floats
+    calibration: dict[str, float]
+    loops: list[Loop]
+
+
+def at_right_angles(
+    drive: Drive, odometry_noise: float, least_moved: float, start_stage: Callable[[str], Progress]
+) -> Attempt:
+    """Return the trajectory with walls at right angles to each other, or why there is none.
+
+    Parameters
+    ----------
+    drive : Drive
+    odometry_noise : float
+        The parameter of this name; 0 to estimate it.
+    least_moved : float
+        Least difference from odometry of an accepted trajectory, metres.
+    start_stage : callable
+        Receives the name of a stage, and returns the callable that receives its progress.
+    """
+    start_stage('directions of walls')
+    found_heading, vote_gain = heading_of_walls(drive.windows, drive.scans, odometry_noise)
+    if found_heading is None:
+        return _kept(drive, NO_WALLS)
+    solver_of = partial(_solver_of, drive, start_stage)
+    walls = _along_walls(drive, found_heading, vote_gain, solver_of(found_heading), start_stage)
+    # matching takes most of the time, and is left out if nothing supports its result
+    if not walls.proven and not walls.votes_suffice:
+        if walls.heading.certainty < LEAST_CERTAINTY:
+            return _heading_lost(drive, walls.heading.certainty)
+        if walls.vote_gain <= LEAST_VOTE_GAIN:
+            return _unproven(drive, walls, walls.verdict)
+    found = solve_hypotheses(drive.scans, walls.heading, walls.solver, walls.along, solver_of)
+    if found.certainty < LEAST_CERTAINTY:
+        return _heading_lost(drive, found.certainty)
+    start_stage('judgement')
+    best = _best_of(drive, walls, found)
+    verdict = walls.verdict if walls.proven else _at_revisits(drive, walls, best.nodes)
+    if not verdict.accepted:
+        return _unproven(drive, walls, verdict)
+    return _accepted(drive, best, verdict, walls.heading.drifts.noise, least_moved)
+
+
+def heading_of_walls(windows: Windows, scans: Scans, odometry_noise: float) -> tuple[Heading | None, float]:
+    """Return the heading from walls, and by how many nats votes are likelier than with the yaw of odometry.
+
+    The same gain of random ranges is subtracted.
+    """
+    noises = (odometry_noise,) if odometry_noise else NOISES
+    found = heading(windows, *wall_votes(windows, scans.held_out), noises)
+    if found is None:
+        return None, 0.0
+    # a robot that drives and looks along two axes gets votes for these even with random ranges
+    readings, rng = windows.readings, np.random.default_rng(0)
+    drawn = np.where(readings.echo, rng.random(len(readings)) * readings.z_max, readings.z)
+    randomised = replace(windows, readings=replace(readings, z=drawn))
+    chance = heading(randomised, *wall_votes(randomised, scans.held_out), noises)
+    gain_by_chance = 0.0 if chance is None else max(chance.over_odometry, 0.0)
+    return found, found.over_odometry - gain_by_chance
+
+
+def _solver_of(drive: Drive, start_stage: Callable[[str], Progress], heading: Heading) -> Solver:
+    return Solver(drive.odometry, drive.windows, drive.scans, heading, start_stage)
+
+
+def _along_walls(
+    drive: Drive, heading: Heading, vote_gain: float, solver: Solver, start_stage: Callable[[str], Progress]
+) -> _AlongWalls:
+    """Solve a drive along straight walls, and compare it with odometry."""
+    along = solver.along_walls()
+    calibration = solver.calibration_of(along)
+    simple = solver.simple(calibration)
+    better = gain_over_drive(drive.scans, drive.windows.node, simple, start_stage('judgement'))
+    return _AlongWalls(heading, vote_gain, solver, along, _by_name(calibration), simple, better)
+
+
+def _best_of(drive: Drive, walls: _AlongWalls, found: Solved) -> _Candidate:
+    """Return the solution with matches, or the one before it that predicts held-out readings better."""
+    solver, simple = found.solver, walls.simple
+    if solver is not walls.solver:
+        simple = solver.simple(solver.calibration_of(found.along))
+    nodes = last_not_worse(drive.scans, simple, found.along.nodes, found.solution.nodes)
+    if nodes is found.solution.nodes:
+        return _Candidate(nodes, _by_name(solver.calibration_of(found.solution)), found.loops)
+    return _Candidate(nodes, walls.calibration, [])
+
+
+def _kept(
+    drive: Drive, reason: str, calibration: Mapping[str, float] | None = None, gain: float = 0.0, sure: bool = False
+) -> Attempt:
+    """Return odometry as it is."""
+    refused = Refinement(False, reason, drive.readings, drive.odometry, dict(calibration or {}), gain=gain)
+    return Attempt(refused, drive.windows.node, sure)
+
+
+def _heading_lost(drive: Drive, certainty: float) -> Attempt:
+    """Return odometry, since the heading is only this certain."""
+    reason = f'the heading was lost: the probability that it is not wrong by a right angle is only {certainty:.0%}'
+    refused = Refinement(False, reason, drive.readings, drive.odometry, {}, lost=True)
+    return Attempt(refused, drive.windows.node)
+
+
+def _unproven(drive: Drive, walls: _AlongWalls, verdict: _Verdict) -> Attempt:
+    """Return odometry, since nothing shows that it is wrong."""
+    along = refined(drive.odometry, drive.windows, walls.along.nodes)
+    # if walls agree with odometry, other methods need not be tried
+    agrees = differences(drive.odometry, along)[0] < LEAST_MOVED
+    return _kept(drive, verdict.words + NOT_ENOUGH, walls.calibration, verdict.gain.mean, agrees)
+
+
+def _at_revisits(drive: Drive, walls: _AlongWalls, nodes: Floats) -> _Verdict:
+    """Judge refined nodes where the robot came back, or by votes of walls if it did not.
+
+    Revisits show drift over the whole drive, and walls that are not parallel. Whether the robot came back is decided
+    along the refined nodes, since by odometry it may be wrong.
+    """
+    revisited = has_revisits(drive.scans, nodes)
+    if not revisited and not walls.votes_suffice:
+        return walls.verdict
+    better = gain_at_revisits(drive.scans, drive.windows.node, nodes)
+    words = gain_words(better)
+    if revisited:
+        return _Verdict(better.sigmas >= LEAST_SIGMAS, better, f'with recognised places, {words}')
+    if better.sigmas < LEAST_SIGMAS_WITH_WALLS:
+        return _Verdict(False, better, words)
+    likelier = f'the readings are more likely by {walls.vote_gain:.0f} nats than with odometry'
+    return _Verdict(True, better, f'with walls at right angles, {likelier}; {words}')
+
+
+def _accepted(drive: Drive, best: _Candidate, verdict: _Verdict, noise: float, least_moved: float) -> Attempt:
+    """Return the trajectory of nodes that are better than odometry; odometry if that is hardly off."""
+    readings, odometry, windows, scans = drive
+    trajectory = refined(odometry, windows, best.nodes)
+    moved, turned = differences(odometry, trajectory)
+    if moved < least_moved:
+        reason = f'odometry is off by {moved:.2f} m, which is not more than the accuracy of sonar'
+        return _kept(drive, reason, best.calibration, verdict.gain.mean, sure=True)
+    outcome = Refinement(
+        True,
+        verdict.words,
+        replaced(readings, odometry, trajectory),
+        trajectory,
+        best.calibration,
+        moved,
+        turned,
+        len(best.loops),
+        verdict.gain.mean,
+        noise=noise,
+    )
+    sure = recognised_part(scans, best.nodes, best.loops) >= LEAST_RECOGNISED and turns_supported(scans, best.nodes)
+    return Attempt(outcome, best.nodes, sure)
+
+
+def _by_name(calibration: Floats) -> dict[str, float]:
+    return dict(zip(CALIBRATION, calibration.tolist(), strict=True))
