@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import gc
 from collections.abc import Callable
+from contextlib import ExitStack
 from functools import partial
 from typing import Any
 
@@ -215,14 +216,16 @@ class MapperNode(ManagedNode):
     def close(self) -> None:
         """End the work in the background, also of a configuration that failed."""
         self._started = self.mapping = False
-        # compilation is finished in any case, for the next configuration
-        while self._ends:
-            self._ends.pop()()
-        # calls that wait will get no result
-        for service in self._calls:
-            service.end('the node is being cleaned up')
-        self._calls.clear()
+        calls, ends = self._calls, self._ends
+        self._calls, self._ends = [], []
         self._when_ready.clear()
+        with ExitStack() as work:
+            # calls that wait will get no result
+            for service in calls:
+                work.callback(service.end, 'the node is being cleaned up')
+            # the last one first; compilation is finished in any case, for the next configuration
+            for end in ends:
+                work.callback(end)
 
     def _undo(self) -> None:
         super()._undo()
@@ -303,12 +306,11 @@ class MapperNode(ManagedNode):
         self.live.change(parameters)
         if self.online:
             self.online.change(parameters)
-            if (parameters.model, parameters.search) == (before.model, before.search):
-                pass
-            elif self.mapping:
-                self.feed.restart_online()
-            else:
-                self._when_ready.append(self.feed.restart_online)
+            if (parameters.model, parameters.search) != (before.model, before.search):
+                if self.mapping:
+                    self.feed.restart_online()
+                else:
+                    self._when_ready.append(self.feed.restart_online)
         if parameters.node.publish_rate != before.node.publish_rate:
             self._live_timer.timer_period_ns = round(NANOSECONDS / parameters.node.publish_rate)
             # otherwise the old period ends first

@@ -8,6 +8,7 @@ sensors together, since most robots have one driver for all, and if there is no 
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ..common.readings import Floats
 from .message_batch import Ranges
@@ -114,31 +115,51 @@ class LimitWatch:
         """Return warnings; empty if there is no suspicion."""
         if not self._of:
             return []
-        if of_all := _suspicion(np.concatenate([samples.values for samples in self._of.values()])):
+        values = [samples.values for samples in self._of.values()]
+        sensor = np.repeat(np.arange(len(values)), [len(of_one) for of_one in values])
+        if of_all := _suspicion(np.concatenate(values), sensor):
             return [of_all]
-        found = {frame: _suspicion(samples.values, alone=True) for frame, samples in sorted(self._of.items())}
+        found = {frame: _suspicion(samples.values) for frame, samples in sorted(self._of.items())}
         return [f'sensor {frame}: {suspicion}' for frame, suspicion in found.items() if suspicion]
 
 
-def _suspicion(values: Floats, alone: bool = False) -> str:
-    """Return what is wrong with ranges and limits, shape (N, 3), in words; '' if there is no suspicion.
+def _suspicion(values: Floats, sensor: NDArray[np.int64] | None = None) -> str:
+    """Return what is wrong with ranges and limits, in words; '' if there is no suspicion.
 
-    `alone` is true for those of a single sensor.
+    Parameters
+    ----------
+    values : float64, shape (N, 3)
+        Ranges, least ranges and largest ranges.
+    sensor : int64, shape (N,), optional
+        The sensor of each, if they are those of all sensors.
     """
-    ranges, _, limits = samples = values.T
-    finite = samples[:, np.isfinite(ranges) & (ranges > 0) & (limits > 0) & (limits < np.inf)]
-    if finite.shape[1] < ENOUGH:
+    ranges, _, limits = values.T
+    used = np.isfinite(ranges) & (ranges > 0) & (limits > 0) & (limits < np.inf)
+    if np.count_nonzero(used) < ENOUGH:
         return ''
+    finite, sensor = values[used].T, None if sensor is None else sensor[used]
     # one cause has several symptoms; the first that is reported is enough
-    return _beyond(finite, alone) or _far(finite) or _below(finite, alone)
+    return _beyond(finite, sensor) or _far(finite) or _below(finite, sensor)
 
 
-def _beyond(samples: Floats, alone: bool) -> str:
+def _are_many(found: NDArray[np.bool_], sensor: NDArray[np.int64] | None) -> bool:
+    """Return whether ranges with a symptom are so many, and of so many sensors, that their units must differ."""
+    count = np.count_nonzero(found)
+    if sensor is None:
+        return bool(count >= MANY_OF_ONE * len(found))
+    # wrong units are those of the driver, while a single sensor may be covered or broken
+    by_sensor, of_sensor = np.bincount(sensor[found], minlength=1), np.bincount(sensor)
+    most = int(by_sensor.argmax())
+    rest = len(found) - of_sensor[most]
+    return bool(count >= MANY * len(found) and count - by_sensor[most] >= MANY * rest)
+
+
+def _beyond(samples: Floats, sensor: NDArray[np.int64] | None) -> str:
     ranges, _, limits = samples
     beyond = ranges > BEYOND * limits
     counts = np.unique(ranges[beyond], return_counts=True)[1]
     count = int(counts.sum())
-    if count < (MANY_OF_ONE if alone else MANY) * len(ranges) or counts.max() > SENTINEL * count:
+    if not _are_many(beyond, sensor) or counts.max() > SENTINEL * count:
         return ''
     # no echo comes from beyond max_range, whatever its unit
     ratio = _at(0.98, (ranges / limits)[beyond])
@@ -150,16 +171,16 @@ def _beyond(samples: Floats, alone: bool) -> str:
     )
 
 
-def _below(samples: Floats, alone: bool) -> str:
+def _below(samples: Floats, sensor: NDArray[np.int64] | None) -> str:
     ranges, least, limits = samples
     # limits that contradict each other are rejected for that
     below = (ranges < least) & (least < limits)
     count = int(below.sum())
-    if count < (MANY_OF_ONE if alone else MANY) * len(ranges):
+    if not _are_many(below, sensor):
         return ''
     limit = _middle(least)
     # a sonar's blind zone is a few centimetres, and its limits have one unit; a single sensor may be covered by dirt
-    if limit < 1.0 and (alone or _middle((least / ranges)[below]) < 2.0):
+    if limit < 1.0 and (sensor is None or _middle((least / ranges)[below]) < 2.0):
         return ''
     return (
         f'{count} of {len(ranges)} examined ranges are below min_range ({limit:g} m), and so are rejected: are '
