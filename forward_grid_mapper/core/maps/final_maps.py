@@ -1,4 +1,9 @@
-"""The final maps, made after the search in the same way by the offline tool, the node and tiles."""
+"""The final maps, made after the search in the same way by the offline tool, the node and tiles.
+
+Echoes of people who walk by add up at a few cells: as independent readings, they outweigh those that passed there, and
+the search keeps these cells. The uncertainty map knows that readings repeat each other, and that walls do not stand
+alone in the open. So an obstacle is removed if each of its cells is likelier free than occupied by that map.
+"""
 
 from __future__ import annotations
 
@@ -16,6 +21,10 @@ from .free_space import expected_passes
 from .line_of_sight import mirror_images, not_passed
 from .post_processing import grown, post_process
 from .uncertainty import uncertainty_map
+
+
+LEAST_PROBABILITY = 0.5
+"""Least probability of one of the cells of an obstacle."""
 
 
 class FinalMaps(NamedTuple):
@@ -50,4 +59,22 @@ def final_maps(evidence: Evidence, search: SearchParameters, traversed: NDArray[
     ml[images] = UNKNOWN
     uncertainty = uncertainty_map(evidence.of_occupancy(), passes, ml, traversed, search)
     uncertainty[images] = np.nan
+    unlikely = unlikely_obstacles(ml, uncertainty)
+    ml[unlikely] = np.where(grown(ml == 0, 0.0, evidence)[unlikely], 0, UNKNOWN)
     return FinalMaps(ml, uncertainty)
+
+
+def unlikely_obstacles(ml: NDArray[np.int8], probability: NDArray[np.float32]) -> NDArray[np.bool_]:
+    """Return the cells of obstacles that are likelier free than occupied in each cell, shape `ml.shape`.
+
+    An obstacle is a set of occupied cells that touch, also at corners. Those at the border may be parts of larger ones.
+    """
+    from scipy import ndimage
+
+    label, count = ndimage.label(ml == 1, np.ones((3, 3)))
+    likely = np.zeros(count + 1, bool)
+    likely[0] = True
+    for cells in (label[probability >= LEAST_PROBABILITY], label[[0, -1]], label[:, [0, -1]]):
+        likely[cells] = True
+    out: NDArray[np.bool_] = ~likely[label]
+    return out
