@@ -23,7 +23,7 @@ from ..core.runtime.compiling import compiling
 from ..core.search.search import Progress
 from .signals import Cancelled, Interruptible, cancelled_line
 
-COMPILES = '(compiling kernels; this takes half a minute and is done once)'
+COMPILES = '(compiling kernels; this takes one to three minutes and is done once)'
 
 PATIENCE = 1.0
 """Seconds of work before progress is shown."""

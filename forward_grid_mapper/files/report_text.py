@@ -19,7 +19,7 @@ UNTESTED = (
 _LABEL = 14
 _WIDTH = 100
 _SHOWN = 6
-# fraction of random readings that recordings with good poses do not have
+# fraction of the echoes that are not random in recordings with good poses
 _MANY = 0.2
 
 
@@ -213,9 +213,13 @@ def _result(data: dict[str, Any]) -> Iterator[str]:
         share = _share(unexplained, readings)
         are = 'is most likely a random measurement' if unexplained == 1 else 'are most likely random measurements'
         sought = any(source.get('trajectory') for source in (data.get('input') or {}, *(data.get('drives') or [])))
-        many = unexplained > _MANY * (readings or math.inf) and not sought
+        rows = (data.get('sensors') or {}).values()
+        silent = sum(row.get('no_echo') or 0 for row in rows)
+        # readings without an echo are hardly ever random measurements, and some sensors have few echoes
+        many = unexplained > _MANY * ((readings or math.inf) - silent) and not sought
         option = '--refine-poses' if (data.get('input') or {}).get('bag') else 'refine_poses'
-        hint = f': many, as with odometry that drifts ({option}), or wrong poses of sensors' if many else ''
+        causes = f'odometry that drifts ({option}), wrong poses of sensors, or people who walk by'
+        hint = f': many, as with {causes}' if many else ''
         yield from _line('Random', f'{counted(unexplained, "reading", ",")} ({share}) {are}{hint}')
     work = [f'{statistics[key]:,} {key}' for key in ('pairs', 'iterations', 'flips', 'shifts') if statistics.get(key)]
     if (converged := statistics.get('converged')) is not None:

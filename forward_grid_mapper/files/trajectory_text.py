@@ -85,6 +85,8 @@ def estimate_words(estimates: Mapping[str, Estimate]) -> str:
         error = math.degrees(sigma) if name in ('bias', 'heading') else 100 * sigma / (1 + value) ** 2
         words.append(f'{said} (± {error:.1f}{"°" if name in ("bias", "heading") else " %"})')
     if unknown := [_ASKED[name] for name in CALIBRATION if name not in estimates]:
+        if len(unknown) == len(CALIBRATION):
+            return 'the drive does not determine the errors of the wheels'
         words.append(f'the drive does not show {" or ".join(unknown)}')
     return '; '.join(words)
 

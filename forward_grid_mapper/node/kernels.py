@@ -47,7 +47,7 @@ class Kernels:
     def begin(self, ready: Callable[[], None]) -> None:
         """Begin to compile; `ready` is called, in another thread, when the kernels of the live map are compiled."""
         self.at_work.add(self)
-        self._log('preparing kernels; the first start compiles them, which takes half a minute or more')
+        self._log('preparing kernels; the first start compiles them, which takes one to three minutes')
         begin = time.monotonic()
         # the collector would scan all objects of the compiler again and again, and delay the executor
         gc.disable()

@@ -320,7 +320,7 @@ def test_quiet_mentions_compilation_once(monkeypatch: pytest.MonkeyPatch) -> Non
     with Ticker(quiet=True, stream=stream) as ticker:
         ticker.say('one')
         with compiling_begun():
-            wait_until_shown(stream, 'compiling kernels; this takes half a minute and is done once\n')
+            wait_until_shown(stream, 'compiling kernels; this takes one to three minutes and is done once\n')
             ticker.say('two')
         with compiling_begun():
             ticker.say('three')

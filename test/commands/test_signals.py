@@ -95,7 +95,7 @@ def test_signal_during_the_work_leaves_no_files(tmp_path: Path, number: signal.S
     done = interrupted(tmp_path, 'matplotlib', number, 'process_bag', bag, '-q', '-o', tmp_path / 'new' / 'maps')
     assert (done.returncode, done.stdout) == (128 + number, '')
     # if this test runs alone, kernels must be compiled
-    message = done.stderr.removeprefix('compiling kernels; this takes half a minute and is done once\n')
+    message = done.stderr.removeprefix('compiling kernels; this takes one to three minutes and is done once\n')
     assert message == 'process_bag: cancelled; nothing was written\n'
     assert everything_in(tmp_path) == before
 

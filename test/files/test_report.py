@@ -108,6 +108,8 @@ def test_broken_sensor_is_in_the_warnings_and_the_table() -> None:
 
 def test_many_random_readings_give_a_hint_to_refine_poses() -> None:
     maps = made_maps(readings=200)
+    silent = np.arange(200) % 2 == 0
+    half = dataclasses.replace(maps.readings, z=np.where(silent, maps.readings.z_max, maps.readings.z))
     for part, source, option in (
         (50, {}, 'refine_poses'),
         (50, {'bag': 'monday'}, '--refine-poses'),
@@ -116,9 +118,12 @@ def test_many_random_readings_give_a_hint_to_refine_poses() -> None:
     ):
         some = dataclasses.replace(maps, unexplained=np.arange(200) < part)
         text = ' '.join(report_text(report_data(some, source)).split())
-        hint = f'many, as with odometry that drifts ({option}), or wrong poses of sensors'
+        hint = f'many, as with odometry that drifts ({option}), wrong poses of sensors, or people who walk by'
         assert (hint in text) == (option is not None)
         assert ('many, as' in text) == (option is not None)
+    # readings without an echo are hardly ever random
+    some = dataclasses.replace(maps, readings=half, unexplained=~silent & (np.arange(200) < 50))
+    assert 'many, as' in report_text(report_data(some, {}))
 
 
 def test_report_without_source() -> None:

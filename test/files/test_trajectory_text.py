@@ -42,6 +42,7 @@ def test_calibration_in_words() -> None:
     assert calibration_words({'scale': 0.001}) == ''
     # turns that are measured twice as large as they are have the factor 0.5
     assert calibration_words({'turn_scale': -0.5}) == 'turns are measured 100.0 % too large'
+    assert estimate_words({}) == 'the drive does not determine the errors of the wheels'
     assert estimate_words({'scale': Estimate(0.25, 0.025)}).startswith(
         'distances are measured 20.0 % too short (± 1.6 %)'
     )

@@ -22,7 +22,6 @@ from .line_of_sight import mirror_images, not_passed
 from .post_processing import grown, post_process
 from .uncertainty import uncertainty_map
 
-
 LEAST_PROBABILITY = 0.5
 """Least probability of one of the cells of an obstacle."""
 

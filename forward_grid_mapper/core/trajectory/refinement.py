@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from ..common.errors import InputError
 from ..common.parameters import Parameters
-from ..common.readings import Readings
+from ..common.readings import Floats, Readings
 from ..runtime.cancelling import check
 from .after_jumps import Part, begins_of, parts_at, with_doubtful
 from .any_angle import match_drive
@@ -38,6 +38,8 @@ from .right_angles import at_right_angles
 from .scans import Scans
 from .standing import without_stands
 from .windows import TRAVEL, Odometry, cut
+
+SHOWN_BY_MATCHING = '; scan matching alone shows that odometry is wrong, and explains the readings less well'
 
 NOR_MATCHES = '; scan matching alone gives no better trajectory'
 
@@ -146,7 +148,9 @@ class Refiner:
         better = gain_at_revisits(scans, windows.node, nodes)
         if better.sigmas < LEAST_SIGMAS:
             return _without_better(by_walls.refinement)
-        at_revisits = 'with recognised places, ' if has_revisits(scans, nodes) else ''
+        if known is None and (better_by_walls := self._by_walls_after_all(drive, nodes, least_moved)) is not None:
+            return better_by_walls
+        at_revisits = 'where the robot came back, ' if has_revisits(scans, nodes) else ''
         by_name = dict.fromkeys(CALIBRATION, 0.0) | {
             name: estimate.value
             for name, estimate in yaw_errors(odometry, trajectory).items()
@@ -165,6 +169,18 @@ class Refiner:
             better.mean,
             right_angles=False,
         )
+
+    def _by_walls_after_all(self, drive: Drive, nodes: Floats, least_moved: float) -> Refinement | None:
+        """Return the trajectory with walls at right angles, if readings are likelier on its map; None otherwise.
+
+        `nodes`, shape (K, 3), are those of matching alone, which have shown that odometry is wrong.
+        """
+        noise = self._parameters.association.odometry_noise
+        by_walls = at_right_angles(drive, noise, least_moved, self._start_stage, odometry_is_wrong=True)
+        found = by_walls.refinement
+        if not found.accepted or gain_of_objective(drive.scans, by_walls.nodes, nodes).mean > 0:
+            return None
+        return replace(found, reason=found.reason + SHOWN_BY_MATCHING)
 
     def _start_stage(self, stage: str) -> Callable[[float], None]:
         def progress(part: float) -> None:

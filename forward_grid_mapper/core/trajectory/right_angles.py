@@ -103,7 +103,11 @@ class _Candidate(NamedTuple):
 
 
 def at_right_angles(
-    drive: Drive, odometry_noise: float, least_moved: float, start_stage: Callable[[str], Progress]
+    drive: Drive,
+    odometry_noise: float,
+    least_moved: float,
+    start_stage: Callable[[str], Progress],
+    odometry_is_wrong: bool = False,
 ) -> Attempt:
     """Return the trajectory with walls at right angles to each other, or why there is none.
 
@@ -116,6 +120,8 @@ def at_right_angles(
         Least difference from odometry of an accepted trajectory, metres.
     start_stage : callable
         Receives the name of a stage, and returns the callable that receives its progress.
+    odometry_is_wrong : bool
+        Whether this is known, so that the trajectory need not show it.
     """
     start_stage('directions of walls')
     found_heading, vote_gain = heading_of_walls(drive.windows, drive.scans, odometry_noise)
@@ -124,7 +130,7 @@ def at_right_angles(
     solver_of = partial(_solver_of, drive, start_stage)
     walls = _along_walls(drive, found_heading, vote_gain, solver_of(found_heading), start_stage)
     # matching takes most of the time, and is left out if nothing supports its result
-    if not walls.proven and not walls.votes_suffice:
+    if not (walls.proven or walls.votes_suffice or odometry_is_wrong):
         if walls.heading.certainty < LEAST_CERTAINTY:
             return _heading_lost(drive, walls.heading.certainty)
         if walls.vote_gain <= LEAST_VOTE_GAIN:
@@ -135,7 +141,7 @@ def at_right_angles(
     start_stage('judgement')
     best = _best_of(drive, walls, found)
     verdict = walls.verdict if walls.proven else _at_revisits(drive, walls, best.nodes)
-    if not verdict.accepted:
+    if not (verdict.accepted or odometry_is_wrong):
         return _unproven(drive, walls, verdict)
     return _accepted(drive, best, verdict, walls.heading.drifts.noise, least_moved)
 
@@ -219,7 +225,7 @@ def _at_revisits(drive: Drive, walls: _AlongWalls, nodes: Floats) -> _Verdict:
     better = gain_at_revisits(drive.scans, drive.windows.node, nodes)
     words = gain_words(better)
     if revisited:
-        return _Verdict(better.sigmas >= LEAST_SIGMAS, better, f'with recognised places, {words}')
+        return _Verdict(better.sigmas >= LEAST_SIGMAS, better, f'where the robot came back, {words}')
     if better.sigmas < LEAST_SIGMAS_WITH_WALLS:
         return _Verdict(False, better, words)
     likelier = f'the readings are more likely by {walls.vote_gain:.0f} nats than with odometry'

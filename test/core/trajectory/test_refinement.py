@@ -14,7 +14,8 @@ from forward_grid_mapper.core.common.parameters import Parameters
 from forward_grid_mapper.core.common.readings import Readings
 from forward_grid_mapper.core.mapping import Mapper
 from forward_grid_mapper.core.trajectory import refinement, right_angles
-from forward_grid_mapper.core.trajectory.attempt import gain_words
+from forward_grid_mapper.core.trajectory.any_angle import MatchedDrive
+from forward_grid_mapper.core.trajectory.attempt import Attempt, Drive, gain_words
 from forward_grid_mapper.core.trajectory.heading import NOISES, Drifts, Heading
 from forward_grid_mapper.core.trajectory.holding_out import (
     FEWEST_BLOCKS,
@@ -117,7 +118,7 @@ def test_recognised_places_prove_what_nearby_readings_do_not(tour, bent, monkeyp
     monkeypatch.setattr(right_angles, 'gain_over_drive', lambda *rest: Gain(-0.05, 0.01))
     found, true = Refiner(Parameters()).run(*bent), odometry_of(tour).pose
     assert found.accepted
-    assert found.reason.startswith('with recognised places, readings are predicted better than')
+    assert found.reason.startswith('where the robot came back, readings are predicted better than')
     assert rms_after_alignment(found.trajectory.pose, true) < 0.2
     # the same without such places, and without walls that contradict the yaw
     monkeypatch.setattr(right_angles, 'gain_at_revisits', lambda *rest: Gain(0.0, 0.01))
@@ -128,6 +129,31 @@ def test_recognised_places_prove_what_nearby_readings_do_not(tour, bent, monkeyp
         assert 'does not show that odometry is wrong' in outcome.reason
 
 
+@pytest.mark.parametrize(
+    ('accepted', 'gain', 'by_walls'), [(True, -1.0, True), (True, 1.0, False), (False, -1.0, False)]
+)
+def test_walls_are_tried_again_once_matching_shows_that_odometry_is_wrong(
+    bent, monkeypatch, accepted: bool, gain: float, by_walls: bool
+) -> None:
+    (readings, odometry), asked = bent, []
+
+    def at_right_angles(drive: Drive, *rest, odometry_is_wrong: bool = False) -> Attempt:
+        asked.append(odometry_is_wrong)
+        outcome = Refinement(odometry_is_wrong and accepted, 'walls', readings, odometry, {})
+        return Attempt(outcome, drive.windows.node)
+
+    def matched(odometry: Odometry, scans: Scans, *rest) -> MatchedDrive:
+        return MatchedDrive(scans.windows.node * (1.1, 1.0, 1.0), [], 0.0, 1.0)
+
+    monkeypatch.setattr(refinement, 'at_right_angles', at_right_angles)
+    monkeypatch.setattr(refinement, 'match_drive', matched)
+    monkeypatch.setattr(refinement, 'gain_at_revisits', lambda *rest: Gain(1.0, 0.1))
+    monkeypatch.setattr(refinement, 'gain_of_objective', lambda *rest: Gain(gain, 0.1))
+    found = Refiner(Parameters()).run(readings, odometry)
+    assert asked == [False, True] and found.accepted
+    assert found.reason.startswith('walls; scan matching alone shows' if by_walls else 'walls are not assumed')
+
+
 def test_walls_are_no_proof_if_recognised_places_do_not_confirm(bent, monkeypatch, solved_once) -> None:
     # walls that are not parallel give a wrong yaw, and readings are predicted about as well
     monkeypatch.setattr(refinement, 'match_drive', no_matches)
@@ -135,7 +161,7 @@ def test_walls_are_no_proof_if_recognised_places_do_not_confirm(bent, monkeypatc
     monkeypatch.setattr(right_angles, 'gain_at_revisits', lambda *rest: Gain(0.001, 0.01))
     left = Refiner(Parameters()).run(*bent)
     assert not left.accepted
-    assert left.reason.startswith('with recognised places, readings are predicted better than')
+    assert left.reason.startswith('where the robot came back, readings are predicted better than')
     assert 'does not show that odometry is wrong' in left.reason
     # if the robot visited no place twice, walls are proof, unless readings are predicted worse
     monkeypatch.setattr(right_angles, 'has_revisits', lambda *rest: False)
