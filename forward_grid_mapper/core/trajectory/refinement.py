@@ -39,7 +39,7 @@ from .scans import Scans
 from .standing import without_stands
 from .windows import TRAVEL, Odometry, cut
 
-SHOWN_BY_MATCHING = '; scan matching alone shows that odometry is wrong, and explains the readings less well'
+SHOWN_BY_MATCHING = '; scan matching alone shows that odometry is wrong, and does not explain more'
 
 NOR_MATCHES = '; scan matching alone gives no better trajectory'
 
@@ -171,14 +171,14 @@ class Refiner:
         )
 
     def _by_walls_after_all(self, drive: Drive, nodes: Floats, least_moved: float) -> Refinement | None:
-        """Return the trajectory with walls at right angles, if readings are likelier on its map; None otherwise.
+        """Return the trajectory with walls at right angles, unless matching alone explains more; then None.
 
         `nodes`, shape (K, 3), are those of matching alone, which have shown that odometry is wrong.
         """
         noise = self._parameters.association.odometry_noise
         by_walls = at_right_angles(drive, noise, least_moved, self._start_stage, odometry_is_wrong=True)
         found = by_walls.refinement
-        if not found.accepted or gain_of_objective(drive.scans, by_walls.nodes, nodes).mean > 0:
+        if not found.accepted or gain_of_objective(drive.scans, by_walls.nodes, nodes).sigmas >= LEAST_SIGMAS:
             return None
         return replace(found, reason=found.reason + SHOWN_BY_MATCHING)
 
