@@ -59,7 +59,7 @@ def final_maps(evidence: Evidence, search: SearchParameters, traversed: NDArray[
     uncertainty = uncertainty_map(evidence.of_occupancy(), passes, ml, traversed, search)
     uncertainty[images] = np.nan
     unlikely = unlikely_obstacles(ml, uncertainty)
-    ml[unlikely] = np.where(grown(ml == 0, 0.0, evidence)[unlikely], 0, UNKNOWN)
+    ml[unlikely] = np.where(grown(ml == 0, FREE_MARGIN, evidence)[unlikely], 0, UNKNOWN)
     return FinalMaps(ml, uncertainty)
 
 
