@@ -19,7 +19,7 @@ UNTESTED = (
 _LABEL = 14
 _WIDTH = 100
 _SHOWN = 6
-# fraction of the echoes that are not random in recordings with good poses
+# fraction of the echoes; fewer are random in recordings with good poses
 _MANY = 0.2
 
 

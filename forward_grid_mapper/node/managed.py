@@ -146,10 +146,12 @@ class ManagedNode(Base):
 
     def _undo(self) -> None:
         """End the work, and destroy the entities created for it."""
-        self.close()
-        while self._created:
-            destroy, entity = self._created.pop()
-            destroy(entity)
+        try:
+            self.close()
+        finally:
+            while self._created:
+                destroy, entity = self._created.pop()
+                destroy(entity)
 
     def destroy_node(self) -> None:
         """Destroy the node, and its state machine, which would keep the node in the middleware."""

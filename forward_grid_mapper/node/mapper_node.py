@@ -228,12 +228,14 @@ class MapperNode(ManagedNode):
                 work.callback(end)
 
     def _undo(self) -> None:
-        super()._undo()
-        # `Kernels` froze the existing objects, and the collector ignores frozen ones
-        for name in vars(self).keys() - self._own - {'_own'}:
-            delattr(self, name)
-        gc.unfreeze()
-        gc.collect()
+        try:
+            super()._undo()
+        finally:
+            # `Kernels` froze the existing objects, and the collector ignores frozen ones
+            for name in vars(self).keys() - self._own - {'_own'}:
+                delattr(self, name)
+            gc.unfreeze()
+            gc.collect()
 
     # the start
 

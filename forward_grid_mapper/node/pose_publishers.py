@@ -76,7 +76,7 @@ class PosePublishers:
         self._pose = None if self._send else node.create_publisher(PoseWithCovarianceStamped, '~/pose', 10)
         self._path = node.create_publisher(Path, '~/path', LATCHED)
         self._sent: tuple[int, tuple[float, ...]] = (-1, ())
-        self._stamps = deque[int](maxlen=REMEMBERED)
+        self._stamps, self._latest = deque[int](maxlen=REMEMBERED), -1
         self._due = 0.0
 
     @property
@@ -114,7 +114,9 @@ class PosePublishers:
             transform = TransformStamped(child_frame_id=odom_frame)
             transform.header.frame_id = map_frame
             _set_stamp(transform.header.stamp, stamp + TOLERANCE)
-            self._stamps.append(stamp_of(transform.header))
+            self._stamps.append(sent_at := stamp_of(transform.header))
+            # a stamp far ahead stays the newest on TF
+            self._latest = max(self._latest, sent_at)
             transform.transform.translation.x, transform.transform.translation.y = x, y
             _set_yaw(transform.transform.rotation, yaw)
             self._send(transform)
@@ -128,8 +130,8 @@ class PosePublishers:
             self._pose.publish(message)
 
     def sent_at(self, stamp: int) -> bool:
-        """Return whether a transform with this stamp, nanoseconds, was sent on TF lately."""
-        return stamp in self._stamps
+        """Return whether a transform with this stamp, nanoseconds, was sent on TF, lately or as the latest."""
+        return stamp == self._latest or stamp in self._stamps
 
     def forget(self) -> None:
         """Send the next transform with any stamp, since the clock jumped or a new drive begins."""

@@ -121,6 +121,7 @@ class Trajectory:
         self._jump: _Jump | None = None
         self._since = -1
         self._showing = False
+        self._foreign: int | None = None
 
     @property
     def obstacle(self) -> str:
@@ -268,11 +269,16 @@ class Trajectory:
 
         `latest` returns the stamp of the newest transform on TF, given the target and the source frame, or None.
         """
+        before, self._foreign = self._foreign, None
         if self._out is None or not self.on or self.obstacle or not self.listening():
             return ''
         frames = self.frame.lstrip('/'), self._associator.map_frame.lstrip('/')
         stamp = latest(*frames) if all(frames) else None
         if stamp is None or self._out.sent_at(stamp):
+            return ''
+        self._foreign = stamp
+        # the last transform of a node that has ended may be the newest for a while; a static one has the stamp 0
+        if before is None or (stamp and stamp == before):
             return ''
         return (
             f'another node publishes the transform from {frames[0]} to {frames[1]} as well, so the pose of the robot '

@@ -2,7 +2,8 @@
 
 Echoes of people who walk by add up at a few cells: as independent readings, they outweigh those that passed there, and
 the search keeps these cells. The uncertainty map knows that readings repeat each other, and that walls do not stand
-alone in the open. So an obstacle is removed if each of its cells is likelier free than occupied by that map.
+alone in the open. So with the prior for walls, an obstacle is removed if each of its cells is likelier free than
+occupied by that map.
 """
 
 from __future__ import annotations
@@ -19,7 +20,7 @@ from ..evidence.evidence import Evidence
 from ..search.prior import has_walls
 from .free_space import expected_passes
 from .line_of_sight import mirror_images, not_passed
-from .post_processing import grown, post_process
+from .post_processing import grown, grown_through, post_process
 from .uncertainty import uncertainty_map
 
 LEAST_PROBABILITY = 0.5
@@ -68,12 +69,13 @@ def unlikely_obstacles(ml: NDArray[np.int8], probability: NDArray[np.float32]) -
 
     An obstacle is a set of occupied cells that touch, also at corners. Those at the border may be parts of larger ones.
     """
-    from scipy import ndimage
-
-    label, count = ndimage.label(ml == 1, np.ones((3, 3)))
-    likely = np.zeros(count + 1, bool)
-    likely[0] = True
-    for cells in (label[probability >= LEAST_PROBABILITY], label[[0, -1]], label[:, [0, -1]]):
-        likely[cells] = True
-    out: NDArray[np.bool_] = ~likely[label]
+    occupied = ml == 1
+    likely = occupied & (probability >= LEAST_PROBABILITY)
+    for edge in (np.s_[:1], np.s_[-1:], np.s_[:, :1], np.s_[:, -1:]):
+        likely[edge] = occupied[edge]
+    grows = True
+    while grows:
+        before, likely = likely, grown_through(likely, occupied, 1)
+        grows = not np.array_equal(before, likely)
+    out: NDArray[np.bool_] = occupied & ~likely
     return out

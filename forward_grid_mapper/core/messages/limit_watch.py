@@ -26,7 +26,7 @@ BEYOND = 1.1
 
 MANY, MANY_OF_ONE = 0.15, 0.3
 """Fractions of the finite ranges that are beyond max_range, or below min_range, if units differ: of all sensors, which
-may be of several kinds, and of one sensor."""
+may be of several kinds, also without the one with the most such ranges; and of one sensor."""
 
 SENTINEL = 0.5
 """If one value has this fraction of the ranges beyond, the driver sends it for 'no echo'."""
@@ -137,7 +137,12 @@ def _suspicion(values: Floats, sensor: NDArray[np.int64] | None = None) -> str:
     used = np.isfinite(ranges) & (ranges > 0) & (limits > 0) & (limits < np.inf)
     if np.count_nonzero(used) < ENOUGH:
         return ''
-    finite, sensor = values[used].T, None if sensor is None else sensor[used]
+    finite = values[used].T
+    if sensor is not None:
+        several = sensor.max() > 0
+        sensor = sensor[used]
+        # the others have no ranges to compare with
+        sensor = None if several and np.ptp(sensor) == 0 else sensor
     # one cause has several symptoms; the first that is reported is enough
     return _beyond(finite, sensor) or _far(finite) or _below(finite, sensor)
 

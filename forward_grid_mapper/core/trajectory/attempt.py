@@ -27,11 +27,26 @@ class Drive(NamedTuple):
 
 
 class Attempt(NamedTuple):
-    """The result by one method, its nodes, and whether it is so sure that no other method needs to be tried."""
+    """The result by one method.
+
+    Attributes
+    ----------
+    refinement : Refinement
+    nodes : float64, shape (K, 3)
+        Its nodes.
+    sure : bool
+        Whether it is so sure that no other method needs to be tried.
+    before_matching : bool
+        Whether it was refused before anything was matched, because nothing showed that odometry is wrong.
+    unproven : Attempt or None
+        The trajectory that was refused after matching, because it did not show that odometry is wrong.
+    """
 
     refinement: Refinement
     nodes: Floats
     sure: bool = False
+    before_matching: bool = False
+    unproven: Attempt | None = None
 
 
 def refined(odometry: Odometry, windows: Windows, nodes: Floats) -> Odometry:

@@ -5,7 +5,8 @@ heading         yaw from the directions of walls at right angles, by a hidden Ma
 straight walls  distances to walls, which keep the trajectory straight and give scale and heading of the wheels
 matching        each block is matched with a local map of what was driven before it, then of what lies around it
 loop closures   blocks are matched with local maps of other visits
-scan matching   if walls give no heading or a doubtful one: matching alone, then loop closures
+scan matching   if walls give no heading or a doubtful one: matching alone, then loop closures; if this shows that
+                odometry is wrong, walls are tried again
 judgement       the trajectory is accepted if held-out readings or walls support it; otherwise odometry is kept
 """
 
@@ -148,8 +149,8 @@ class Refiner:
         better = gain_at_revisits(scans, windows.node, nodes)
         if better.sigmas < LEAST_SIGMAS:
             return _without_better(by_walls.refinement)
-        if known is None and (better_by_walls := self._by_walls_after_all(drive, nodes, least_moved)) is not None:
-            return better_by_walls
+        if known is None and (walls := self._by_walls_after_all(drive, by_walls, nodes, least_moved)) is not None:
+            return walls
         at_revisits = 'where the robot came back, ' if has_revisits(scans, nodes) else ''
         by_name = dict.fromkeys(CALIBRATION, 0.0) | {
             name: estimate.value
@@ -170,16 +171,28 @@ class Refiner:
             right_angles=False,
         )
 
-    def _by_walls_after_all(self, drive: Drive, nodes: Floats, least_moved: float) -> Refinement | None:
-        """Return the trajectory with walls at right angles, unless matching alone explains more; then None.
+    def _by_walls_after_all(
+        self, drive: Drive, refused: Attempt, nodes: Floats, least_moved: float
+    ) -> Refinement | None:
+        """Return the trajectory with walls at right angles, unless matching alone is better; then None.
 
-        `nodes`, shape (K, 3), are those of matching alone, which have shown that odometry is wrong.
+        `nodes`, shape (K, 3), are those of matching alone, which have shown that odometry is wrong; `refused` is the
+        attempt with walls, which has not.
         """
-        noise = self._parameters.association.odometry_noise
-        by_walls = at_right_angles(drive, noise, least_moved, self._start_stage, odometry_is_wrong=True)
-        found = by_walls.refinement
-        if not found.accepted or gain_of_objective(drive.scans, by_walls.nodes, nodes).sigmas >= LEAST_SIGMAS:
+        by_walls = refused.unproven
+        if refused.before_matching:
+            noise = self._parameters.association.odometry_noise
+            by_walls = at_right_angles(drive, noise, least_moved, self._start_stage, odometry_is_wrong=True)
+        if by_walls is None or not by_walls.refinement.accepted:
             return None
+        for compared in (gain_at_revisits, gain_of_objective):
+            try:
+                if compared(drive.scans, by_walls.nodes, nodes).sigmas >= LEAST_SIGMAS:
+                    return None
+            except InputError:
+                # the map along this trajectory is too large
+                return None
+        found = by_walls.refinement
         return replace(found, reason=found.reason + SHOWN_BY_MATCHING)
 
     def _start_stage(self, stage: str) -> Callable[[float], None]:

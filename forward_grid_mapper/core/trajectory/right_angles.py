@@ -134,16 +134,18 @@ def at_right_angles(
         if walls.heading.certainty < LEAST_CERTAINTY:
             return _heading_lost(drive, walls.heading.certainty)
         if walls.vote_gain <= LEAST_VOTE_GAIN:
-            return _unproven(drive, walls, walls.verdict)
+            return _unproven(drive, walls, walls.verdict)._replace(before_matching=True)
     found = solve_hypotheses(drive.scans, walls.heading, walls.solver, walls.along, solver_of)
     if found.certainty < LEAST_CERTAINTY:
         return _heading_lost(drive, found.certainty)
     start_stage('judgement')
     best = _best_of(drive, walls, found)
     verdict = walls.verdict if walls.proven else _at_revisits(drive, walls, best.nodes)
-    if not (verdict.accepted or odometry_is_wrong):
-        return _unproven(drive, walls, verdict)
-    return _accepted(drive, best, verdict, walls.heading.drifts.noise, least_moved)
+    attempt = _accepted(drive, best, verdict, walls.heading.drifts.noise, least_moved)
+    if verdict.accepted or odometry_is_wrong:
+        return attempt
+    unproven = attempt if attempt.refinement.accepted else None
+    return _unproven(drive, walls, verdict)._replace(unproven=unproven)
 
 
 def heading_of_walls(windows: Windows, scans: Scans, odometry_noise: float) -> tuple[Heading | None, float]:

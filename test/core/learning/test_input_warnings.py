@@ -399,7 +399,7 @@ def test_sensor_that_sees_the_robot_gives_no_warning_of_no_echo() -> None:
     assert not [text for text in warnings_of(near) if 'if there is no echo' in text]
 
 
-@pytest.mark.parametrize(('sensors', 'part'), [(8, 0.4), (8, 1.0), (4, 1.0)])
+@pytest.mark.parametrize(('sensors', 'part'), [(8, 0.4), (8, 1.0), (4, 1.0), (2, 1.0)])
 def test_covered_sensor_gives_no_warning_of_units(sensors: int, part: float) -> None:
     """It sees the dirt on it, nearer than min_range."""
     rng, (frame, *others) = np.random.default_rng(0), list(circling().extrinsics)
@@ -407,6 +407,8 @@ def test_covered_sensor_gives_no_warning_of_units(sensors: int, part: float) -> 
         lambda m: m._replace(range=0.04) if m.frame_id == frame and rng.random() < part else m
     )
     covered = covered._replace(ranges=[m for m in covered.ranges if m.frame_id in (frame, *others[: sensors - 1])])
+    if sensors == 2:
+        covered = covered.with_ranges(lambda m: m if m.frame_id == frame else m._replace(range=math.inf))
     assert not [text for text in warnings_of(covered) if 'must state metres' in text]
 
 

@@ -130,24 +130,27 @@ def test_recognised_places_prove_what_nearby_readings_do_not(tour, bent, monkeyp
 
 
 @pytest.mark.parametrize(
-    ('accepted', 'gain', 'by_walls'), [(True, 0.2, True), (True, 0.3, False), (False, -1.0, False)]
+    ('accepted', 'held_out_gain', 'gain', 'by_walls'),
+    [(True, 0.2, 0.2, True), (True, 0.2, 0.3, False), (True, 0.3, 0.2, False), (False, 0.0, 0.0, False)],
 )
 def test_walls_are_tried_again_once_matching_shows_that_odometry_is_wrong(
-    bent, monkeypatch, accepted: bool, gain: float, by_walls: bool
+    bent, monkeypatch, accepted: bool, held_out_gain: float, gain: float, by_walls: bool
 ) -> None:
     (readings, odometry), asked = bent, []
 
     def at_right_angles(drive: Drive, *rest, odometry_is_wrong: bool = False) -> Attempt:
         asked.append(odometry_is_wrong)
         outcome = Refinement(odometry_is_wrong and accepted, 'walls', readings, odometry, {})
-        return Attempt(outcome, drive.windows.node)
+        return Attempt(outcome, drive.windows.node, before_matching=not odometry_is_wrong)
 
     def matched(odometry: Odometry, scans: Scans, *rest) -> MatchedDrive:
         return MatchedDrive(scans.windows.node * (1.1, 1.0, 1.0), [], 0.0, 1.0)
 
     monkeypatch.setattr(refinement, 'at_right_angles', at_right_angles)
     monkeypatch.setattr(refinement, 'match_drive', matched)
-    monkeypatch.setattr(refinement, 'gain_at_revisits', lambda *rest: Gain(1.0, 0.1))
+    # first that over odometry, then that over walls
+    gains = iter((1.0, held_out_gain))
+    monkeypatch.setattr(refinement, 'gain_at_revisits', lambda *rest: Gain(next(gains), 0.1))
     monkeypatch.setattr(refinement, 'gain_of_objective', lambda *rest: Gain(gain, 0.1))
     found = Refiner(Parameters()).run(readings, odometry)
     assert asked == [False, True] and found.accepted

@@ -119,7 +119,7 @@ def test_building_without_right_angles_is_refined(exact, bent) -> None:
     outcome = Refiner(Parameters()).run(recording.readings, odometry)
     assert rms_after_alignment(odometry.pose, true.pose) > 0.6
     assert outcome.accepted and not outcome.right_angles
-    assert outcome.reason.startswith('walls are not assumed to be at right angles; with recognised places')
+    assert outcome.reason.startswith('walls are not assumed to be at right angles; where the robot came back')
     assert rms_after_alignment(outcome.trajectory.pose, true.pose) < 0.25
     assert outcome.trajectory.pose[0] == pytest.approx(odometry.pose[0], abs=1e-6)
     assert outcome.loops > 0
@@ -194,7 +194,7 @@ def test_objective_is_that_of_the_map_without_held_out_readings(scans) -> None:
 
 
 @pytest.mark.parametrize('again', [True, False])
-def test_reason_names_recognised_places_only_with_revisits(bent, scans, matched, monkeypatch, again: bool) -> None:
+def test_reason_says_that_the_robot_came_back_only_if_it_did(bent, scans, matched, monkeypatch, again: bool) -> None:
     recording, odometry = bent
     monkeypatch.setattr(refinement, 'gain_at_revisits', lambda *rest: Gain(0.1, 0.01))
     monkeypatch.setattr(refinement, 'gain_of_objective', lambda *rest: Gain(0.1, 0.01))
@@ -204,7 +204,7 @@ def test_reason_names_recognised_places_only_with_revisits(bent, scans, matched,
     drive_of = Drive(recording.readings, odometry, scans.windows, scans)
     found = Refiner(Parameters())._at_any_angle(drive_of, by_walls(scans, recording, odometry), 0.15)
     assert not found.right_angles
-    assert ('with recognised places' in found.reason) == again
+    assert ('where the robot came back' in found.reason) == again
     # none of the places is recognised
     assert found.reason.endswith(
         '; 0% of the path through places seen before is recognised: the drive may be bent as a whole'
