@@ -40,7 +40,7 @@ from .scans import Scans
 from .standing import without_stands
 from .windows import TRAVEL, Odometry, cut
 
-SHOWN_BY_MATCHING = '; scan matching alone shows that odometry is wrong, and does not explain more'
+SHOWN_BY_MATCHING = '; scan matching alone shows that odometry is wrong, and is no better than walls at right angles'
 
 NOR_MATCHES = '; scan matching alone gives no better trajectory'
 
