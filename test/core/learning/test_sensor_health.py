@@ -94,13 +94,13 @@ def test_sensor_that_sees_the_robot_now_and_then_is_found() -> None:
     assert health_of_counts(readings.sensor_names, counts)['sonar_04'].verdict == 'always short'
 
 
-@pytest.mark.parametrize(('front', 'sensor'), [(False, 5), (True, 3)])
-def test_sensor_with_a_wrong_pose_is_named(front: bool, sensor: int) -> None:
-    """The walls along which the robot drives still explain half of its readings."""
+@pytest.mark.parametrize(('front', 'sensor', 'verdict'), [(False, 5, 'often random'), (True, 3, 'mostly random')])
+def test_sensor_with_a_wrong_pose_is_named(front: bool, sensor: int, verdict: str) -> None:
+    """The walls along which the robot drives still explain about half of its readings."""
     readings = rooms(front)
     turned = readings.yaw + np.where(readings.sensor == sensor, math.radians(20.0), 0.0)
     found = suspects(dataclasses.replace(readings, yaw=turned))
-    assert found == {readings.sensor_names[sensor]: 'often random'}
+    assert found == {readings.sensor_names[sensor]: verdict}
 
 
 def test_correct_sensors_are_ok() -> None:
