@@ -213,7 +213,7 @@ def _decisive_evidence(maps: MapArchive, found: CellEvidence, state: int) -> str
     if (total > 0) != (state == 1):
         return (
             'its own evidence is for the opposite state: it belongs to a wall that is closed, extended or removed as '
-            'a whole, or to an obstacle that is removed since its cells are likelier free by the uncertainty map'
+            'a whole, or to an obstacle of which no cell is more likely occupied than free in the uncertainty map'
         )
     against = found.nats[(found.nats < 0) if state == 1 else (found.nats > 0)]
     typical = float(np.abs(against).max(initial=0.0))
