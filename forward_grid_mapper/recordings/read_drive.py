@@ -231,7 +231,8 @@ def read_drive(
         associator = BatchAssociator(lookup, parameters)
         live = FullLiveMap(associator, parameters)
         # a reading is placed by the poses before and after it
-        margin = parameters.association.max_pose_gap * NANOSECONDS
+        times = parameters.association
+        margin = (times.max_pose_gap + abs(times.range_time_offset)) * NANOSECONDS
         spans = Spans(part, margin)
         for batch in bag.batches(topics, progress):
             associator.add_batch(spans.select(batch))

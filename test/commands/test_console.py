@@ -273,9 +273,9 @@ def test_warnings_are_printed_during_long_work(monkeypatch: pytest.MonkeyPatch) 
             ticker.say('index')
         for stream in (log, screen):
             wait_until_shown(stream, 'index')
+        for ticker, stream in ((one, log), (two, screen)):
             begin = len(stream.getvalue())
-            one.say('search')
-            two.say('search')
+            ticker.say('search')
             wait_until_shown(stream, 'search', begin)
     assert log.getvalue().startswith('warning: max_range is 400 m\nwarning: no echo\n')
     assert screen.getvalue().startswith('\r\033[Kwarning: max_range is 400 m\n\r\033[Kwarning: no echo\n')

@@ -30,6 +30,14 @@ class AssociationParameters:
         0.01,
         600.0,
     )
+    range_time_offset: float = param(
+        0.0,
+        'Seconds that are added to the stamps of Range messages: less than 0 if drivers stamp readings too late. The '
+        'report names the value that fits a drive.',
+        's',
+        -2.0,
+        2.0,
+    )
     over_range: str = param(
         'no_echo',
         'What +inf and ranges at or beyond max_range mean: no echo within max_range, or no information.',

@@ -3,53 +3,45 @@
 Such faults cause no error message, only a wrong map. Each of them can be undone: mirrored sensors are mirrored back,
 stamps are shifted back. So a small map of a part of the drive is made for each assumed fault, with the fault undone,
 and compared with the map of the unchanged readings. If the input is sound, none of them explains the readings better.
+Small offsets, of stamps or of the poses of the sensors, are then estimated from a longer part (`sensor_calibration`).
 
-Poses and cones are changed, never ranges, so the likelihoods of all these maps can be compared. Ranges that are too
-large by a factor look like odometry that is too small by it.
+Ranges that are too large by a factor look like odometry that is too small by it.
 
-It costs some twenty maps of at most `MOST` readings each, however long the drive is.
+It costs some thirty maps of at most `MOST` readings each, however long the drive is, and a dozen larger ones for each
+offset that is estimated.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from operator import itemgetter
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-from ..common.errors import InputError
 from ..common.parameters import Parameters
-from ..common.readings import Floats, Readings, in_canonical_order
-from ..evidence.evidence import Evidence
-from ..maps.log_odds_map import map_grid
-from ..maps.traversed import traversed_cells
+from ..common.readings import Readings
 from ..messages.message_types import NANOSECONDS, Pose2
-from ..runtime.memory import memory_for_pairs
-from ..runtime.threads import cores
-from ..search.search import Search
+from .sensor_calibration import FORWARD, LEFT, QUANTITIES, TIME, YAW, Estimate, Quantity, as_good, estimates
+from .trial_maps import MountedReadings, coarse, trial_map
 
 MOST, ENOUGH = 800, 300
 """Most readings of the part that is mapped; with fewer than the second, no check is made."""
 
-CELL, REACH = 0.1, 60.0
-"""Smallest cells of these maps, metres, and most cells that the 0.9 quantile of ranges spans: they limit the cost."""
-
 GAIN = 0.1
 """Nats a reading by which the map with a fault undone must be better. In sound drives it is at most 0.05."""
-
-LEAST_SHIFT, SHIFT_GAIN = 0.2, 0.15
-"""Smallest shift of stamps that is tried, seconds: stamps of real sensors may be that late. Nats a reading that it must
-gain; in sound drives it gains at most 0.11."""
 
 TOTAL = 50.0
 """Nats by which it must be better in total."""
 
-SHIFTS = (LEAST_SHIFT, 0.5, 0.75, 1.0)
-"""Seconds by which stamps are shifted, in both directions."""
+LONG, THIN = 4000, 1200
+"""Readings of the part from which offsets are guessed, and how many of them are mapped: offsets show over a longer part
+than other faults."""
+
+SUSPICIOUS = 12.0
+"""Nats that the best guess of an offset must gain for the offset to be estimated."""
 
 FACTORS = (0.3048, 0.5, 2.0, 3.281)
 """Scale factors of odometry that are tried: feet for metres, and radius for diameter of a wheel, and their inverses."""
@@ -64,11 +56,8 @@ odometry drifts; it is at most 0.04 better if the sensors are rotated by 15°.""
 WIDEST = 1.5
 """Largest half field of view, radians."""
 
-STEP = 0.05
-"""Metres of driving over which a direction of travel is measured."""
-
 STEPS = 40
-"""Fewest such steps for checks of the direction of travel."""
+"""Fewest steps of `travel` for checks of the direction of travel."""
 
 ALIGNED, AWRY = 0.9, 0.7
 """Mean resultant lengths of angles: at least the first if they agree, at most the second if they do not."""
@@ -82,39 +71,9 @@ SPINNING = 10.0
 TURNED, TURNING = 2 * math.pi, 0.05
 """Least total turn, radians, and least fraction of the time with such fast turns: odometry may jump now and then."""
 
+CHECK = 'check the poses of the sensors on the robot (parameters, --sensor or transforms)'
+
 REP_103 = 'REP 103 has x forward, y to the left and yaw counter-clockwise'
-
-
-@dataclass(frozen=True)
-class _Drive:
-    """Readings, sorted by stamp, with the pose of the robot at each of them.
-
-    `robot` and `extrinsics` have shape (3, N): x, y in metres and yaw in radians, of the robot in the map frame and of
-    the sensor in the frame of the robot.
-    """
-
-    readings: Readings
-    robot: Floats
-    extrinsics: Floats
-
-    def part(self, which: slice) -> _Drive:
-        return _Drive(self.readings.select(which), self.robot[:, which], self.extrinsics[:, which])
-
-    def placed(self, robot: Floats | None = None, extrinsics: Floats | None = None) -> Readings:
-        """Return the readings with other poses of the robot, or of the sensors on it."""
-        x, y, yaw = self.robot if robot is None else robot
-        forward, left, turn = self.extrinsics if extrinsics is None else extrinsics
-        cos, sin = np.cos(yaw), np.sin(yaw)
-        return replace(
-            self.readings, x=x + cos * forward - sin * left, y=y + sin * forward + cos * left, yaw=yaw + turn
-        )
-
-    def robot_at(self, seconds: float) -> Floats:
-        """Return the robot's poses so many seconds after the stamps, shape (3, N)."""
-        stamp = (self.readings.stamp - self.readings.stamp[0]) / NANOSECONDS
-        known, first = np.unique(stamp, return_index=True)
-        columns = (self.robot[0], self.robot[1], np.unwrap(self.robot[2]))
-        return np.stack([np.interp(stamp + seconds, known, column[first]) for column in columns])
 
 
 def consistency_warnings(
@@ -133,73 +92,75 @@ def consistency_warnings(
     -----
     Swapped left and right are not found in a straight drive, and shifted stamps hardly in a slow one.
     """
-    drive = _drive(readings, extrinsics)
-    if drive is None:
+    drive = MountedReadings.of(readings, extrinsics)
+    if len(drive) < ENOUGH:
         return []
     # a yaw in degrees looks random, and so may look like any other fault
     if warning := _spinning(drive) or _axes(drive):
         return [warning]
-    drive = _stretch(drive)
-    p = _coarse(parameters or Parameters(), drive.readings)
-    count, given = len(drive.readings), _objective(drive.readings, p)
-    gains = (((_objective(fault.undone, p) - given) / count, fault) for fault in _faults(drive))
-    gain, fault = max(gains, key=itemgetter(0))
-    if gain < max(fault.least, TOTAL / count):
-        return []
-    return [f'{fault.warning} (with this corrected, a map explains {count} readings better by {gain:.2f} nats each)']
+    parameters = parameters or Parameters()
+    part = drive.moving_part(MOST)
+    p = coarse(parameters, part.readings)
+    count, given = len(part), trial_map(part.readings, p).objective
+    tried = ((trial_map(fault.undone, p).objective - given, fault) for fault in _faults(part))
+    gain, fault = max(tried, key=itemgetter(0))
+    known = gain / count if gain >= max(fault.least * count, TOTAL) else 0.0
+    found = _offsets(drive, parameters, known)
+    if found and found[0].gain > known * found[0].readings:
+        return [_of_offset(found, parameters.association.range_time_offset)]
+    return [_explained(fault.warning, count, gain)] if known else []
 
 
-def _drive(readings: Readings, extrinsics: Mapping[str, Pose2]) -> _Drive | None:
-    """Return the readings of known sensors by stamp, with the poses of the robot; None if there are too few."""
-    known = np.array([name in extrinsics for name in readings.sensor_names] or [False])
-    chosen = np.flatnonzero(known[readings.sensor])
-    if len(chosen) < ENOUGH:
-        return None
-    readings = readings.select(chosen[np.argsort(readings.stamp[chosen], kind='stable')])
-    nowhere = Pose2(0.0, 0.0, 0.0)
-    table = np.array([extrinsics.get(name, nowhere) for name in readings.sensor_names], np.float64)
-    forward, left, turn = mounted = table[readings.sensor].T
-    yaw = readings.yaw - turn
-    cos, sin = np.cos(yaw), np.sin(yaw)
-    robot = np.stack([readings.x - cos * forward + sin * left, readings.y - sin * forward - cos * left, yaw])
-    return _Drive(readings, robot, mounted)
+def _offsets(drive: MountedReadings, parameters: Parameters, known: float) -> list[Estimate]:
+    """Return the significant offsets that may explain the readings better than by `known`, nats a reading."""
+    part = drive.moving_part(LONG).thinned(THIN)
+    p = coarse(parameters, part.readings)
+    given, suspects = trial_map(part.readings, p).objective, {}
+    for quantity in QUANTITIES:
+        tried = ((trial_map(quantity.corrected(part, guess), p).objective, guess) for guess in quantity.guesses)
+        best, guess = max(tried)
+        if best - given >= max(SUSPICIOUS, known * len(part)):
+            suspects[quantity] = guess
+    return estimates(drive, suspects, parameters) if suspects else []
 
 
-def _stretch(drive: _Drive) -> _Drive:
-    """Return the `MOST` consecutive readings with the most driving and turning, where wrong poses matter most."""
-    count = len(drive.readings)
-    if count <= MOST:
-        return drive
-    x, y, yaw = drive.robot
-    moved = np.concatenate([[0.0], np.cumsum(np.hypot(np.diff(x), np.diff(y)) + np.abs(np.diff(np.unwrap(yaw))))])
-    # turns of the path count as well, in case the yaw is wrong
-    at, directions = _travel(drive)
-    if len(at) > 1:
-        turns = np.concatenate([[0.0], np.cumsum(np.abs(np.diff(np.unwrap(directions))))])
-        moved += np.interp(np.arange(count), at, turns)
-    first = int(np.argmax(moved[MOST - 1 :] - moved[: count - MOST + 1]))
-    return drive.part(slice(first, first + MOST))
+def _explained(warning: str, count: int, gain: float) -> str:
+    better = f'with this corrected, a map explains {count} readings better by {gain / count:.2f} nats each'
+    return f'{warning} ({better})'
 
 
-def _coarse(parameters: Parameters, readings: Readings) -> Parameters:
-    """Return the parameters of the small maps, with coarse cells if ranges are long."""
-    reach = float(np.quantile(readings.z, 0.9))
-    cell = max(parameters.grid.resolution, CELL, reach / REACH)
-    return replace(parameters, grid=replace(parameters.grid, resolution=cell))
+def _of_offset(found: list[Estimate], time_offset: float) -> str:
+    """Return the warning about the best of the estimates; `time_offset` is the one already added to stamps, seconds."""
+    best, *others = found
+    causes = [best, *(each for each in others if as_good(best, each))]
+    said = ', or '.join(_words(each.quantity, each.value, each.error) for each in causes)
+    remedies = []
+    for each in causes:
+        if each.quantity is TIME:
+            remedies.append(
+                f'set the parameter range_time_offset to {time_offset + each.value:.2f}, or correct the drivers, which '
+                'must stamp a reading at the time of its measurement, all by the same clock'
+            )
+        elif CHECK not in remedies:
+            remedies.append(CHECK)
+    remedy = '; or '.join(remedies)
+    which = '. The drive does not tell which: ' if len(causes) > 1 else '; '
+    return _explained(f'{said}{which}{remedy}', best.readings, best.gain)
 
 
-def _objective(readings: Readings, parameters: Parameters) -> float:
-    """Return the objective of the map that the search finds for readings; -inf if the map would be too large."""
-    readings = in_canonical_order(readings)
-    try:
-        grid = map_grid(readings, parameters)
-    except InputError:
-        return -math.inf
-    search = parameters.search
-    evidence = Evidence(grid, parameters.model, memory_for_pairs(parameters), search.threads or cores())
-    evidence.extend(readings)
-    found = Search(evidence, search, traversed_cells(readings, grid).ravel()).run(lambda progress: None)
-    return float(evidence.tempered_log_likelihood + found.log_prior)
+def _words(quantity: Quantity, value: float, error: float) -> str:
+    """Return an offset in words."""
+    size = abs(value)
+    if quantity is TIME:
+        word = 'late' if value < 0 else 'early'
+        return f'the stamps of the readings are {size:.2f} s (±{error:.2f} s) too {word} against those of odometry'
+    if quantity is YAW:
+        size, error, side = math.degrees(size), math.degrees(error), 'left' if value > 0 else 'right'
+        return f'the sensors are rotated by {size:.0f} degrees (±{error:.1f}) to the {side} of their stated poses'
+    side = {(FORWARD, True): 'forward of', (FORWARD, False): 'behind', (LEFT, True): 'to the left of'}.get(
+        (quantity, value > 0), 'to the right of'
+    )
+    return f'the sensors are {size:.2f} m (±{error:.2f} m) {side} their stated poses'
 
 
 class _Fault(NamedTuple):
@@ -210,7 +171,7 @@ class _Fault(NamedTuple):
     least: float = GAIN
 
 
-def _faults(drive: _Drive) -> Iterator[_Fault]:
+def _faults(drive: MountedReadings) -> Iterator[_Fault]:
     """Yield all faults that are checked."""
     yield from _of_axes(drive)
     x, y, yaw = drive.robot
@@ -230,27 +191,18 @@ def _faults(drive: _Drive) -> Iterator[_Fault]:
             replace(drive.readings, half_angle=half),
             NARROW_GAIN if width < 1 else GAIN,
         )
-    for shift in SHIFTS:
-        for sign, word in ((-1, 'late'), (1, 'early')):
-            yield _Fault(
-                f'the stamps of the readings seem to be about {shift:g} s {word} against those of odometry; drivers '
-                'must stamp a reading at the time of its measurement, all by the same clock',
-                drive.placed(robot=drive.robot_at(sign * shift)),
-                SHIFT_GAIN if shift == LEAST_SHIFT else GAIN,
-            )
 
 
-def _of_axes(drive: _Drive) -> Iterator[_Fault]:
+def _of_axes(drive: MountedReadings) -> Iterator[_Fault]:
     """Yield wrong signs and axes."""
     x, y, yaw = drive.robot
     forward, left, turn = drive.extrinsics
-    check = 'check the poses of the sensors on the robot (parameters, --sensor or transforms)'
     yield _Fault(
-        f'left and right of the sensors seem to be swapped; {check}, or the signs of y and yaw in odometry. {REP_103}',
+        f'left and right of the sensors seem to be swapped; {CHECK}, or the signs of y and yaw in odometry. {REP_103}',
         drive.placed(extrinsics=np.stack([forward, -left, -turn])),
     )
     yield _Fault(
-        f'the yaw of the sensors seems to have the wrong sign; {check}. {REP_103}',
+        f'the yaw of the sensors seems to have the wrong sign; {CHECK}. {REP_103}',
         drive.placed(extrinsics=np.stack([forward, left, -turn])),
     )
     yield _Fault(
@@ -258,14 +210,12 @@ def _of_axes(drive: _Drive) -> Iterator[_Fault]:
         drive.placed(robot=np.stack([x, y, -yaw])),
     )
     for degrees, word in ((90, ' to the left'), (-90, ' to the right'), (180, '')):
-        angle = math.radians(-degrees)
-        cos, sin = math.cos(angle), math.sin(angle)
         by = f'{abs(degrees)} degrees{word}'
         yield _Fault(
-            f'the sensors seem to be rotated by {by}; {check}, or the axes of odometry. {REP_103}',
-            drive.placed(extrinsics=np.stack([cos * forward - sin * left, sin * forward + cos * left, turn + angle])),
+            f'the sensors seem to be rotated by {by}; {CHECK}, or the axes of odometry. {REP_103}',
+            drive.rotated(math.radians(-degrees)),
         )
-    at, directions = _travel(drive)
+    at, directions = drive.travel()
     if np.ptp(yaw) < SAME_YAW and len(at) >= 2:
         yield _Fault(
             'the yaw of odometry never changes, although the robot turns; does its driver leave out the orientation? '
@@ -274,16 +224,7 @@ def _of_axes(drive: _Drive) -> Iterator[_Fault]:
         )
 
 
-def _travel(drive: _Drive) -> tuple[NDArray[np.int64], Floats]:
-    """Return indices of readings between which the robot drove `STEP`, and the direction of travel there, radians."""
-    x, y, _ = drive.robot
-    driven = np.concatenate([[0.0], np.cumsum(np.hypot(np.diff(x), np.diff(y)))])
-    at = np.searchsorted(driven, np.arange(STEP, driven[-1], STEP))
-    at = at[np.diff(at, prepend=-1) > 0]
-    return at[:-1], np.arctan2(np.diff(y[at]), np.diff(x[at]))
-
-
-def _spinning(drive: _Drive) -> str:
+def _spinning(drive: MountedReadings) -> str:
     """Return a warning if the yaw is in another unit than radians, so that the robot seems to turn far too fast."""
     known, first = np.unique(drive.readings.stamp, return_index=True)
     seconds = np.diff(known) / NANOSECONDS
@@ -299,13 +240,13 @@ def _spinning(drive: _Drive) -> str:
     )
 
 
-def _axes(drive: _Drive) -> str:
+def _axes(drive: MountedReadings) -> str:
     """Return a warning if the direction of travel turns against the yaw, so that an axis is wrong; otherwise ''.
 
     A robot drives forwards, or backwards, or, if it is holonomic, in any direction. None drives to the right whenever
     it turns to the left, and to the left whenever it turns to the right.
     """
-    at, directions = _travel(drive)
+    at, directions = drive.travel()
     if len(at) < STEPS:
         return ''
     yaw = drive.robot[2, at]

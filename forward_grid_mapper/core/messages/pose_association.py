@@ -164,7 +164,7 @@ class PoseAssociator(MessageAccount):
             return
         measured.number, measured.arrival, measured.sent = self.received, self._clock(), sent
         heapq.heappush(self._waiting, measured)
-        self._newest_range = max(message.stamp, self._newest_range or message.stamp)
+        self._newest_range = max(measured.stamp, self._newest_range or measured.stamp)
         self._settle()
 
     def clear(self, parameters: Parameters | None = None) -> None:

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from ..common.parameter_groups import AssociationParameters
 from ..common.readings import Floats
 from .message_batch import REASON, Ranges
-from .message_types import RangeMessage
+from .message_types import NANOSECONDS, RangeMessage
 
 _SILENT_DRIVER = (
     'a driver should send +inf if there is no echo (REP 117); if it sends NaN, 0 or a negative range, set the '
@@ -173,7 +173,15 @@ def measure(message: RangeMessage, parameters: AssociationParameters) -> Measure
         if parameters.over_range == 'discard':
             return 'over_range'
         z = z_max
-    return Measurement(message, z, z_max, angle / 2, sigma)
+    measurement = Measurement(message, z, z_max, angle / 2, sigma)
+    # a stamp of zero is none
+    if message.stamp:
+        measurement.stamp += _offset(parameters)
+    return measurement
+
+
+def _offset(parameters: AssociationParameters) -> int:
+    return round(parameters.range_time_offset * NANOSECONDS)
 
 
 def rejection_warnings(
@@ -301,6 +309,11 @@ def measure_all(messages: Ranges, parameters: AssociationParameters) -> Measurem
     if parameters.over_range == 'discard':
         reject('over_range', over)
     return Measurements(reason, np.where(over, z_max, z), z_max, angle / 2, sigma)
+
+
+def measured_at(messages: Ranges, parameters: AssociationParameters) -> NDArray[np.int64]:
+    """Return the stamps of many messages with `range_time_offset` added, nanoseconds, shape (N,)."""
+    return np.where(messages.stamp == 0, 0, messages.stamp + _offset(parameters))
 
 
 def proper_name(frame_id: str) -> bool:

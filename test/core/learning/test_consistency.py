@@ -18,6 +18,7 @@ import pytest
 from forward_grid_mapper.core.common.parameters import Parameters
 from forward_grid_mapper.core.common.readings import Readings
 from forward_grid_mapper.core.learning.consistency import consistency_warnings
+from forward_grid_mapper.core.learning.trial_maps import MountedReadings
 from forward_grid_mapper.core.mapping import Mapper
 from forward_grid_mapper.core.messages.message_types import NANOSECONDS, OdometryMessage, Pose2, RangeMessage
 from forward_grid_mapper.files.quality_warning import quality_warning
@@ -116,14 +117,40 @@ SCENARIOS: dict[str, tuple[Callable[[Messages], Messages], str]] = {
     ),
     'ranges half a second late': (
         lambda m: m.late(0.5),
-        r'seem to be about 0\.5 s late.*must stamp a reading at the time of its measurement',
+        # at a constant speed, half a second is a quarter of a metre
+        r'are 0\.[45]\d s \(±0\.0\d s\) too late.*does not tell which.*range_time_offset to -0\.[45]\d,.*at the time',
     ),
-    'ranges a second late': (lambda m: m.late(1.0), r'readings seem to be about 1 s late against those of odometry'),
-    'odometry half a second late': (lambda m: m.late(-0.5), r'readings seem to be about 0\.5 s early'),
-    'odometry 0.8 s late': (lambda m: m.late(-0.8), r'readings seem to be about 0\.75 s early against those of'),
+    'ranges a second late': (
+        lambda m: m.late(1.0),
+        r'readings are (0\.9\d|1\.0\d) s \(±0\.0\d s\) too late against those of odometry',
+    ),
+    'odometry half a second late': (
+        lambda m: m.late(-0.5),
+        r'readings are 0\.[45]\d s \(±0\.0\d s\) too early.*range_time_offset to 0\.[45]\d,',
+    ),
+    'odometry 0.8 s late': (
+        lambda m: m.late(-0.8),
+        r'readings are 0\.(7|8)\d s \(±0\.0\d s\) too early against those of',
+    ),
     'odometry a second late': (
         lambda m: m.late(-1.0),
-        r'seem to be about 1 s early against those of',
+        r'are (0\.9\d|1\.0\d) s \(±0\.0\d s\) too early against those of',
+    ),
+    'ranges 0.15 s late': (
+        lambda m: m.late(0.15),
+        r'are 0\.1[3-7] s \(±0\.0[1-3] s\) too late.*range_time_offset to -0\.1[3-7],',
+    ),
+    'sensors turned by 12 degrees': (
+        lambda m: m.mounted(turned(12)),
+        r'sensors are rotated by 1[0-4] degrees \(±\d\.\d\) to the right of their stated poses; check the poses',
+    ),
+    'sensors stated too far forward': (
+        lambda m: m.mounted(lambda p: Pose2(p.x + 0.2, p.y, p.yaw)),
+        r'the sensors are 0\.(1[6-9]|2[0-4]) m \(±0\.0\d m\) behind their stated poses',
+    ),
+    'sensors stated too far to the right': (
+        lambda m: m.mounted(lambda p: Pose2(p.x, p.y - 0.2, p.yaw)),
+        r'the sensors are 0\.(1[6-9]|2[0-4]) m \(±0\.0\d m\) to the left of their stated poses',
     ),
     'cones of 60 degrees for 15': (
         lambda m: m.wide(4.0),
@@ -149,7 +176,7 @@ SCENARIOS: dict[str, tuple[Callable[[Messages], Messages], str]] = {
 FEW = (
     'left and right of the sensors swapped',
     'odometry in feet',
-    'ranges half a second late',
+    'ranges 0.15 s late',
     'half of the field of view',
 )
 """One scenario of each kind, tried first."""
@@ -239,6 +266,29 @@ def test_real_recordings_give_no_warning(shared: Path, name: str, odometry: str)
     found = read_drive(bag, Parameters(), {}, None, odometry)
     assert len(found.source['extrinsics']) >= 8
     assert consistency_warnings(found.associator.readings, found.source['extrinsics']) == []
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ('change', 'expected'),
+    [
+        (lambda drive: drive.shifted(0.25), r'stamps of the readings are 0\.2\d s \(±0\.0\d s\) too late'),
+        (lambda drive: drive.rotated(math.radians(6)), r'rotated by [567] degrees \(±\d\.\d\) to the right'),
+        (lambda drive: drive.moved(forward=0.12), r'are 0\.1\d m \(±0\.0\d m\) behind their'),
+        (lambda drive: drive.moved(left=-0.12), r'are 0\.1\d m \(±0\.0\d m\) to the left of'),
+    ],
+)
+def test_offsets_are_measured_on_a_recording(
+    shared: Path, change: Callable[[MountedReadings], Readings], expected: str
+) -> None:
+    from forward_grid_mapper.recordings.read_drive import read_drive
+
+    found = read_drive(shared / 'data' / 'building_c' / 'bag', Parameters(), {}, None, '/odom_corrected')
+    extrinsics = found.source['extrinsics']
+    drive = MountedReadings.of(found.associator.readings, extrinsics)
+    # the readings are placed by wrong poses of the sensors
+    (warning,) = consistency_warnings(change(drive), extrinsics)
+    assert re.search(expected, warning), warning
 
 
 @pytest.mark.slow

@@ -130,12 +130,13 @@ def state_of(made: PoseAssociator) -> dict[str, Any]:
     cells=st.sampled_from([50_000_000, 20_000, 10_000]),
     over=st.sampled_from(['no_echo', 'discard']),
     invalid=st.sampled_from(['discard', 'no_echo']),
+    offset=st.sampled_from([0.0, -0.15, 2.0]),
 )
 def test_batches_give_the_result_of_single_messages(
-    seed: int, bad_share: float, bound: int, cells: int, over: str, invalid: str
+    seed: int, bad_share: float, bound: int, cells: int, over: str, invalid: str, offset: float
 ) -> None:
     chosen = {'max_readings': bound, 'max_cells': cells, 'over_range': over, 'invalid_range': invalid}
-    parameters = Parameters.from_flat(chosen)
+    parameters = Parameters.from_flat({**chosen, 'range_time_offset': offset})
     messages = drive(seed, 600, bad_share)
     whole, parts = one_by_one(messages, parameters), in_batches(messages, parameters, seed)
     assert state_of(whole) == state_of(parts)

@@ -117,6 +117,27 @@ def test_pose_of_a_reading_is_interpolated_odometry_and_mount() -> None:
     assert (p.map_frame, p.base_frame) == ('odom', 'base_link')
 
 
+def test_time_offset_is_added_to_the_stamps_of_ranges() -> None:
+    late, right = associator(range_time_offset=-0.15), associator()
+    for made, seconds in ((late, 10.4), (right, 10.25)):
+        made.add_odometry(odometry(10.0))
+        made.add_odometry(odometry(10.5, 2.0, 0.0, 1.0))
+        made.add_range(sonar(seconds))
+        made.add_range(RangeMessage(0, 'sonar', 1.0, 0.1, 4.0, 0.3))
+    assert late.readings.stamp.tolist() == right.readings.stamp.tolist() == [10_250_000_000]
+    assert late.readings.x.tolist() == right.readings.x.tolist()
+    assert late.rejected == right.rejected == {'zero_stamp': 1}
+
+
+def test_reading_with_a_time_offset_waits_for_odometry() -> None:
+    p = associator(range_time_offset=0.2)
+    p.add_odometry(odometry(10.0))
+    p.add_range(sonar(9.9))
+    assert p.waiting == 1
+    p.add_odometry(odometry(10.1))
+    assert p.waiting == 0 and len(p.readings) == 1
+
+
 def test_readings_without_pose_are_rejected_with_reason() -> None:
     clock = Clock()
     p = associator(clock=clock, max_pose_gap=0.5, pose_timeout=1.0)
