@@ -15,10 +15,14 @@ from numpy.typing import NDArray
 from .. import __version__
 from ..core.common.grid import UNKNOWN
 from ..core.common.parameters import TABLE
+from ..core.learning.agreement import contradiction
 from ..core.learning.sensor_health import health_warning, sensor_health
 from ..core.maps.map_set import MapSet
 from .output_folder import output_errors
-from .report_text import report_text
+from .report_text import MANY, report_text
+
+FEW = 0.05
+"""Random part of the echoes below which a map fits its readings."""
 
 __all__ = ['json_text', 'report_data', 'report_text', 'write_report']
 
@@ -63,6 +67,7 @@ def report_data(maps: MapSet, source: Mapping[str, Any]) -> dict[str, Any]:
             'unexplained': int(np.count_nonzero(maps.unexplained)),
             'log_likelihood': maps.log_likelihood,
             'objective': maps.objective,
+            'contradiction': _contradiction(maps, source),
         },
         'seconds': statistics.pop('seconds', {}),
         'statistics': statistics,
@@ -75,6 +80,14 @@ def report_data(maps: MapSet, source: Mapping[str, Any]) -> dict[str, Any]:
     }
     made: dict[str, Any] = plain(data)
     return made
+
+
+def _contradiction(maps: MapSet, source: Mapping[str, Any]) -> float | None:
+    """Return by how much the halves of a drive disagree, nats an echo; None if that is not the question."""
+    if source.get('drives') or source.get('trajectory'):
+        return None
+    unexplained, echoes = (int(np.count_nonzero(each)) for each in (maps.unexplained, maps.readings.echo))
+    return contradiction(maps.readings, maps.parameters) if FEW * echoes < unexplained <= MANY * echoes else None
 
 
 def write_report(folder: Path | str, data: dict[str, Any]) -> None:

@@ -13,6 +13,7 @@ from made_maps import made_maps
 
 from forward_grid_mapper.core.common.errors import OutputError
 from forward_grid_mapper.core.common.parameters import Parameters
+from forward_grid_mapper.files import report
 from forward_grid_mapper.files.report import report_data, write_report
 from forward_grid_mapper.files.report_text import report_text
 
@@ -56,7 +57,14 @@ def test_numbers_are_those_of_the_maps() -> None:
     assert data['map']['free_cells'] == 34 * 24
     assert data['map']['occupied_cells'] == 36 * 26 - 34 * 24
     assert data['map']['unknown_cells'] == 40 * 30 - 36 * 26
-    assert data['result'] == {'readings': 60, 'unexplained': 6, 'log_likelihood': -123.5, 'objective': -150.25}
+    assert data['result'] == {
+        'readings': 60,
+        'unexplained': 6,
+        'log_likelihood': -123.5,
+        'objective': -150.25,
+        # said only of drives with many readings
+        'contradiction': 0.0,
+    }
     for name, counts in (('right', (30, 0, 0)), ('left', (30, 7, 6))):
         row = data['sensors'][f'sonar_{name}']
         assert (row['accepted'], row['no_echo'], row['unexplained']) == counts
@@ -124,6 +132,27 @@ def test_many_random_readings_give_a_hint_to_refine_poses() -> None:
     # readings without an echo are hardly ever random
     some = dataclasses.replace(maps, readings=half, unexplained=~silent & (np.arange(200) < 50))
     assert 'many, as' in report_text(report_data(some, {}))
+
+
+def test_halves_that_contradict_each_other_give_a_hint_to_refine_poses() -> None:
+    data = report_data(made_maps(readings=200), {'bag': 'monday'})
+    hint = 'the two halves of the drive contradict each other, as with odometry that drifts (--refine-poses), wrong'
+    for value, shown in ((0.06, True), (0.02, False), (None, False)):
+        data['result']['contradiction'] = value
+        assert (hint in ' '.join(report_text(data).split())) == shown
+
+
+@pytest.mark.parametrize(
+    ('part', 'source', 'asked'),
+    [(20, {}, True), (5, {}, False), (80, {}, False), (20, {'trajectory': {}, 'drives': [{'bag': 'a'}]}, False)],
+)
+def test_halves_are_compared_only_if_that_may_be_the_cause(
+    monkeypatch: pytest.MonkeyPatch, part: int, source: dict[str, Any], asked: bool
+) -> None:
+    monkeypatch.setattr(report, 'contradiction', lambda readings, parameters: 0.5)
+    maps = made_maps(readings=200)
+    some = dataclasses.replace(maps, unexplained=np.arange(200) < part)
+    assert report_data(some, source)['result']['contradiction'] == (0.5 if asked else None)
 
 
 def test_report_without_source() -> None:

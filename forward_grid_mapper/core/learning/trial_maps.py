@@ -84,10 +84,8 @@ class MountedReadings:
         return self.part(slice(first, first + most))
 
     def thinned(self, most: int) -> MountedReadings:
-        """Return at most so many of the readings, chosen at random, so that none of the sensors is preferred."""
-        if len(self) <= most:
-            return self
-        return self.part(np.sort(np.random.default_rng(0).choice(len(self), most, replace=False)))
+        """Return at most so many of the readings (`thinned`)."""
+        return self if len(self) <= most else self.part(_few(len(self), most))
 
     def travel(self) -> tuple[NDArray[np.int64], Floats]:
         """Return indices of readings between which the robot drove `STEP`, and the direction of travel, radians."""
@@ -137,6 +135,16 @@ class TrialMap(NamedTuple):
 
     objective: float
     blocks: Floats
+
+
+def thinned(readings: Readings, most: int) -> Readings:
+    """Return at most so many readings, chosen at random, so that no sensor is preferred."""
+    return readings if len(readings) <= most else readings.select(_few(len(readings), most))
+
+
+def _few(count: int, most: int) -> NDArray[np.int64]:
+    """Return `most` of the indices below `count`, in order."""
+    return np.sort(np.random.default_rng(0).choice(count, most, replace=False))
 
 
 def coarse(parameters: Parameters, readings: Readings) -> Parameters:
