@@ -20,18 +20,19 @@ from measuring import machine
 from forward_grid_mapper.bags.choice import Topics
 from forward_grid_mapper.bags.poses import POSES
 from forward_grid_mapper.bags.reader import Bag
+from forward_grid_mapper.bags.static_transforms import StaticTransforms
 from forward_grid_mapper.commands.simulate import write_bag
 from forward_grid_mapper.core.common.parameters import Parameters
 from forward_grid_mapper.core.messages.batch_association import BatchAssociator
 from forward_grid_mapper.core.messages.message_types import range_message
 from forward_grid_mapper.core.messages.pose_association import PoseAssociator
-from forward_grid_mapper.recordings.read_drive import Extrinsics
+from forward_grid_mapper.recordings.bag_extrinsics import Extrinsics
 from forward_grid_mapper.simulation.campus import campus_drive
 
 
 def one_by_one(bag: Bag, topics: Topics) -> PoseAssociator:
     """Read a bag message by message."""
-    made = PoseAssociator(Extrinsics({}, bag.static_transforms()), Parameters(), patient=True)
+    made = PoseAssociator(Extrinsics({}, bag.static_transforms(), StaticTransforms), Parameters(), patient=True)
     for topic, message in bag.originals(topics):
         if topic in topics.range_topics:
             made.add_range(range_message(message))
@@ -43,7 +44,7 @@ def one_by_one(bag: Bag, topics: Topics) -> PoseAssociator:
 
 def at_once(bag: Bag, topics: Topics) -> PoseAssociator:
     """Read a bag many messages at once."""
-    made = BatchAssociator(Extrinsics({}, bag.static_transforms()), Parameters())
+    made = BatchAssociator(Extrinsics({}, bag.static_transforms(), StaticTransforms), Parameters())
     for batch in bag.batches(topics):
         made.add_batch(batch)
     made.finish()

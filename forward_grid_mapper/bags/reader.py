@@ -21,12 +21,13 @@ from ..core.messages.repeated_topics import RepeatedTopics
 from .choice import ODOMETRY, RANGE, Topics, choose_range_topics, choose_topics
 from .columns import Columns, InOrder
 from .decoder import TF_MESSAGE, decoder_of
+from .moving_transforms import MovingTransforms
 from .namespaces import by_precedence
 from .opening import open_sources
 from .poses import POSES
 from .repair import Problem, reasons_of, remedies_of, repair_hint
 from .source import Channel, RawMessage, Source, close_all, one_line
-from .static_transforms import StaticTransforms
+from .static_transforms import StaticTransforms, plain
 from .transform_chain import TransformChain, chain_of, constant_transforms
 
 _CONVERSIONS: dict[str, Callable[[Any], RangeMessage | OdometryMessage | None]] = {RANGE: range_message, **POSES}
@@ -271,6 +272,29 @@ class Bag:
             transforms.add_if_valid(parent, child, numbers[:3], numbers[3:])
         transforms.take(self.static_transforms(topics))
         return transforms
+
+    def moving_transforms(self, topics: Topics, base_frame: str, sensor_frame: str) -> MovingTransforms:
+        """Return the transforms by stamp that may connect a sensor to the robot: those on `/tf`, and static ones."""
+        fixed = self.static_transforms(topics)
+        parents, ways = self.moving_frames(), []
+        for frame in (sensor_frame, base_frame):
+            way: list[str] = []
+            at: str | None = plain(frame)
+            while at is not None and at not in way:
+                way.append(at)
+                step = fixed.step(at)
+                at = parents.get(at) if step is None else step[0]
+            ways.append(way)
+        # what is above both does not matter
+        moving = MovingTransforms(fixed, set(ways[0]).symmetric_difference(ways[1]))
+        for channel, message in self._decoded({(topic, TF_MESSAGE) for topic in self.moving_topics()}):
+            if message is None:
+                continue
+            try:
+                moving.add_message(message)
+            except (AttributeError, TypeError, ValueError):
+                self._count_undecodable(channel)
+        return moving
 
     def moving_topics(self) -> set[str]:
         """Return `/tf` and the `tf` of any namespace, if the bag has them."""

@@ -60,7 +60,7 @@ class StaticTransforms:
         InputError
             If the quaternion is not normalised, a number is not finite, a frame is its own parent, or a name is none.
         """
-        parent, child = _plain(parent), _plain(child)
+        parent, child = plain(parent), plain(child)
         if not all(proper_name(name) for name in (parent, child) if name):
             raise InputError(
                 'A static transform has a frame whose name is too long or cannot be printed; fix its publisher.'
@@ -95,7 +95,7 @@ class StaticTransforms:
             self.add(parent, child, translation_xyz, quaternion_xyzw)
         except InputError as error:
             # a wrong transform elsewhere on the robot must not prevent a map that does not need it
-            self.rejected[_plain(child)] = str(error)
+            self.rejected[plain(child)] = str(error)
 
     def add_message(self, message: Any) -> None:
         """Apply `add_if_valid` to a `geometry_msgs/TransformStamped`."""
@@ -120,11 +120,15 @@ class StaticTransforms:
 
     def top_of(self, frame: str) -> str:
         """Return the root of the tree that contains a frame: itself, if it is not known."""
-        return next(reversed(self._ancestors(_plain(frame))))
+        return next(reversed(self._ancestors(plain(frame))))
+
+    def step(self, frame: str) -> tuple[str, Transform] | None:
+        """Return the parent of a frame, by its name without a leading slash, and its pose there; None for a root."""
+        return self._parents.get(frame)
 
     def doubts(self, base_frame: str, sensor_frame: str) -> list[str]:
         """Return the entries of `contradicted` for the frames that connect a sensor to the robot."""
-        to_base, to_sensor = self._ancestors(_plain(base_frame)), self._ancestors(_plain(sensor_frame))
+        to_base, to_sensor = self._ancestors(plain(base_frame)), self._ancestors(plain(sensor_frame))
         # frames above the common ancestor do not matter
         common = next((frame for frame in to_sensor if frame in to_base), None)
         way = [frame for up in (to_sensor, to_base) for frame in takewhile(lambda frame: frame != common, up)]
@@ -145,7 +149,7 @@ class StaticTransforms:
         InputError
             If the frames are not connected because of an invalid transform.
         """
-        base_frame, sensor_frame = _plain(base_frame), _plain(sensor_frame)
+        base_frame, sensor_frame = plain(base_frame), plain(sensor_frame)
         to_base, to_sensor = self._ancestors(base_frame), self._ancestors(sensor_frame)
         common = next((frame for frame in to_sensor if frame in to_base), None)
         if common is None:
@@ -182,5 +186,6 @@ def _same(one: tuple[str, Transform], other: tuple[str, Transform]) -> bool:
     return one[0] == other[0] and np.allclose(one[1], other[1], atol=SAME)
 
 
-def _plain(frame: str) -> str:
+def plain(frame: str) -> str:
+    """Return the name of a frame without leading slashes."""
     return frame.lstrip('/')

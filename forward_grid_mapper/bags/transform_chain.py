@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from ..core.messages.message_types import OdometryMessage, Pose2, stamp_of
 from ..core.messages.quaternions import heading_of, rotation_of
 from .poses import BASE_FRAMES
+from .static_transforms import plain
 
 Numbers = tuple[float, ...]
 """The numbers of a transform's message: x, y, z of the translation, and x, y, z, w of the rotation."""
@@ -37,18 +38,18 @@ class TransformChain:
     """
 
     def __init__(self, links: list[_Link]) -> None:
-        self._latest = {(_plain(link.parent), _plain(link.child)): _matrix(link.first) for link in links}
+        self._latest = {(plain(link.parent), plain(link.child)): _matrix(link.first) for link in links}
         lowest = next(link for link in links if link.moves)
-        self._lowest = _plain(lowest.parent), _plain(lowest.child)
+        self._lowest = plain(lowest.parent), plain(lowest.child)
         self._frames = links[-1].parent, links[0].child
 
     def pose(self, message: Any) -> OdometryMessage | None:
         """Update the links, and return the pose of the robot's base; None if the lowest moving link is not updated."""
         header = None
         for item in message.transforms:
-            frames = _plain(str(item.header.frame_id)), _plain(str(item.child_frame_id))
+            frames = plain(str(item.header.frame_id)), plain(str(item.child_frame_id))
             if frames in self._latest:
-                self._latest[frames] = _matrix(_numbers(item.transform))
+                self._latest[frames] = _matrix(numbers_of(item.transform))
             if frames == self._lowest:
                 header = item.header
         return None if header is None else OdometryMessage(stamp_of(header), *self._frames, self._composed())
@@ -75,7 +76,7 @@ def chain_of(messages: Iterable[Any]) -> TransformChain | None:
     frame = bases[0] if bases else ''
     while frame in links and links[frame] not in up:
         up.append(links[frame])
-        frame = _plain(links[frame].parent)
+        frame = plain(links[frame].parent)
     highest = max((k for k, link in enumerate(up) if link.moves), default=None)
     if highest is None or (highest == 0 and len(bases) == 1):
         return None
@@ -96,14 +97,15 @@ def _links(messages: Iterable[Any]) -> dict[str, _Link]:
     links: dict[str, _Link] = {}
     for message in messages:
         for item in message.transforms:
-            parent, child, numbers = str(item.header.frame_id), str(item.child_frame_id), _numbers(item.transform)
-            link = links.setdefault(_plain(child), _Link(parent, child, numbers))
+            parent, child, numbers = str(item.header.frame_id), str(item.child_frame_id), numbers_of(item.transform)
+            link = links.setdefault(plain(child), _Link(parent, child, numbers))
             link.moves = link.moves or numbers != link.first
-            link.several = link.several or _plain(parent) != _plain(link.parent)
+            link.several = link.several or plain(parent) != plain(link.parent)
     return links
 
 
-def _numbers(transform: Any) -> Numbers:
+def numbers_of(transform: Any) -> Numbers:
+    """Return the numbers of a `geometry_msgs/Transform`."""
     offset, turn = transform.translation, transform.rotation
     return float(offset.x), float(offset.y), float(offset.z), *(float(getattr(turn, name)) for name in 'xyzw')
 
@@ -117,7 +119,3 @@ def _matrix(numbers: Numbers) -> NDArray[np.float64] | None:
     made[:3, :3] = rotation
     made[:3, 3] = numbers[:3]
     return made
-
-
-def _plain(frame: str) -> str:
-    return frame.lstrip('/')

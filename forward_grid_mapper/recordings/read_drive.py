@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from functools import cache, partial
+from functools import partial
 from pathlib import Path
 
 from ..bags.choice import Topics
 from ..bags.decoder import TF_MESSAGE
+from ..bags.moving_transforms import MovingTransforms
 from ..bags.poses import BASE_FRAMES
 from ..bags.reader import Bag, skipped
-from ..bags.static_transforms import StaticTransforms, SteepSensorError
+from ..bags.static_transforms import StaticTransforms
 from ..core.common.errors import BagError, InputError, ParameterError
 from ..core.common.parameters import Parameters
 from ..core.common.shell import quoted
@@ -24,157 +25,16 @@ from ..core.messages.pose_association import PoseAssociator
 from ..core.messages.rep117 import ODOMETRY_REASONS, REASONS, rejection_warnings, sensor_rejections
 from ..files.journal import drive_file
 from ..files.output_folder import readable
+from .bag_extrinsics import Extrinsics
 from .drive import WHOLE, Drive, FullLiveMap, Part, Spans, alternation_note, length_of, thinning_note
 from .given_poses import GivenPoses
 from .journal_drive import read_journal
 from .other_bags import OtherBags
 
-__all__ = ['Drive', 'Extrinsics', 'read_drive']
+__all__ = ['Drive', 'read_drive']
 
 POSES_MISSING = {'unknown_extrinsics', 'after_odometry'}
 """Reasons of rejection if only the poses of the sensors are missing: nearly every bag ends with a range."""
-
-NO_STATIC = (
-    'the bag has no /tf_static (nodes publish it once, as they start: record it from the start; of a split bag the '
-    'first file has it, so give the whole folder, or that file as well)'
-)
-"""Remedy if no transform is known."""
-
-NAMED = 3
-"""Most frames that are named as examples."""
-
-MOST_OPTIONS = 8
-"""Most sensors for which a message contains options to copy."""
-
-
-class Extrinsics:
-    """Poses of the sensors on the robot: given by the user, or else by the bag's static transforms.
-
-    Attributes
-    ----------
-    steep, used, unusable : dict of str
-        By frame: why a sensor is too steep for a planar map, the source of its pose, and why its transform is invalid.
-    doubts : dict
-        Warnings about doubtful poses, in order.
-    moving : mapping of str
-        The parents of moving frames, for `advice`.
-    """
-
-    def __init__(
-        self,
-        given: Mapping[str, Pose2],
-        transforms: StaticTransforms,
-        more: Callable[[], StaticTransforms],
-        others: OtherBags | None = None,
-    ) -> None:
-        """`more` returns transforms that are used if `transforms` do not connect a sensor to the robot.
-
-        `others` are used if there are no `transforms`.
-        """
-        self._given = {frame.lstrip('/'): pose for frame, pose in given.items()}
-        self._transforms, self._more = transforms, cache(more)
-        self._others = others or OtherBags()
-        self._found: dict[tuple[str, str], Pose2 | str | None] = {}
-        self.steep: dict[str, str] = {}
-        self.used: dict[str, str] = {}
-        self.unusable: dict[str, str] = {}
-        self.doubts: dict[str, None] = {}
-        self.moving: Mapping[str, str] = {}
-
-    def __call__(self, base_frame: str, frame: str, stamp: int) -> Pose2 | str | None:
-        """Return the pose of a sensor, as defined by `ExtrinsicsLookup`; static transforms hold for any stamp."""
-        key = (base_frame, frame)
-        if key not in self._found:
-            self._found[key] = self._look_up(base_frame, frame)
-        return self._found[key]
-
-    def _look_up(self, base_frame: str, frame: str) -> Pose2 | str | None:
-        pose = self._given.get(frame.lstrip('/'))
-        if pose is not None:
-            self.used[frame] = 'parameters'
-            return pose
-        transforms, where = self._transforms, '/tf_static'
-        try:
-            pose = transforms.lookup(base_frame, frame)
-            if pose is None and base_frame:
-                transforms, where = self._more(), 'constant transforms on /tf'
-                pose = transforms.lookup(base_frame, frame)
-            if pose is None and base_frame and not len(self._transforms):
-                pose = self._others.lookup(base_frame, frame)
-                where = f'/tf_static of {self._others.used.get(frame)}'
-        except SteepSensorError as error:
-            self.steep[frame] = str(error)
-            return STEEP
-        except InputError as error:
-            self.unusable[frame] = str(error)
-            return None
-        if pose is not None:
-            self.used[frame] = where
-            self.doubts.update(dict.fromkeys(transforms.doubts(base_frame, frame)))
-        return pose
-
-    @property
-    def poses(self) -> dict[str, Pose2]:
-        """Poses of the sensors that have readings, by frame."""
-        return {frame: pose for (_, frame), pose in self._found.items() if isinstance(pose, Pose2)}
-
-    @property
-    def notes(self) -> list[str]:
-        """Warnings about the sources of poses."""
-        return [*self.doubts, *self._others.notes()]
-
-    @property
-    def unused(self) -> list[str]:
-        """Frames with a given pose that have no readings."""
-        return sorted(set(self._given) - {frame.lstrip('/') for frame in self.used})
-
-    def advice(self, base_frame: str, frames: Sequence[str]) -> str:
-        """Return a remedy for frames without a pose."""
-        known = self._transforms.frames
-        joined = f'/tf_static connects {", ".join(known[:12])}' if known else NO_STATIC
-        if not base_frame:
-            joined += '; odometry has no child_frame_id, which is needed to look up transforms'
-        reasons = ''.join(f' {self.unusable[frame]}' for frame in frames if frame in self.unusable)
-        reasons += self._on_joints(frames) + self._other_names(base_frame, frames) + self._others.advice()
-        options = ' '.join(f'--sensor {quoted(f"{frame}=x,y,yaw")}' for frame in frames[:MOST_OPTIONS])
-        more = ', and so on' if len(frames) > MOST_OPTIONS else ''
-        return (
-            f'no pose on the robot (frame {base_frame or "?"}) is known for {", ".join(frames)}: {joined}.{reasons} '
-            f'Give {options}{more}, in metres and radians (or 90deg), or sensors.{frames[0]}.pose in --params'
-        )
-
-    def _other_names(self, base_frame: str, frames: Sequence[str]) -> str:
-        """Return the frames that transforms have with another prefix, in words, or that they lack the robot's."""
-        known = self._transforms.frames
-        by_end = {name.rpartition('/')[2]: name for name in reversed(known)}
-        unknown = [frame for name in (base_frame, *frames) if (frame := name.lstrip('/')) and frame not in known]
-        pairs = [(by_end[end], frame) for frame in unknown if (end := frame.rpartition('/')[2]) in by_end]
-        # two different prefixes are those of two robots
-        found = [f'{name}, not {frame}' for name, frame in pairs if '/' not in name or '/' not in frame]
-        if found:
-            more = f', and {len(found) - NAMED} more' if len(found) > NAMED else ''
-            return (
-                f' The transforms have {"; ".join(found[:NAMED])}{more}: set the same prefix in the drivers of ranges '
-                f'and odometry as in the publisher of the transforms.'
-            )
-        tops = sorted({self._transforms.top_of(frame) for frame in frames} & set(known))
-        if tops and base_frame.lstrip('/') in unknown:
-            return (
-                f' {base_frame} is the child_frame_id of odometry, and the transforms do not join it to {tops[0]}: '
-                f'publish that transform, or have odometry name {tops[0]}.'
-            )
-        return ''
-
-    def _on_joints(self, frames: Sequence[str]) -> str:
-        """Return the frames that are children of moving frames, in words."""
-        tops = {frame.lstrip('/'): self._transforms.top_of(frame) for frame in frames}
-        found = [f'{frame} on {top}' if frame != top else frame for frame, top in tops.items() if top in self.moving]
-        if not found:
-            return ''
-        return (
-            f' Only transforms that may change connect {", ".join(found)} to the robot: sensors on moving joints are '
-            'not supported with bags (the node supports them). If the joint hardly moves, use a fixed pose.'
-        )
 
 
 def read_drive(
@@ -227,8 +87,9 @@ def read_drive(
         else:
             topics = bag.choose_range_topics(range_topics)
         constant = partial(_constant_transforms, path, topics)
-        lookup = Extrinsics(extrinsics, bag.static_transforms(topics), constant, OtherBags(others, topics))
-        associator = BatchAssociator(lookup, parameters)
+        joints = partial(_moving_transforms, path, topics)
+        lookup = Extrinsics(extrinsics, bag.static_transforms(topics), constant, OtherBags(others, topics), joints)
+        associator = BatchAssociator(lookup, parameters, lookup.moves)
         live = FullLiveMap(associator, parameters)
         # a reading is placed by the poses before and after it
         times = parameters.association
@@ -243,8 +104,9 @@ def read_drive(
             associator.add_batch(batch_of(list(enumerate(given))))
         associator.finish()
         undecodable = dict(bag.undecodable)
+        moving = {}
         if topics.odom_type == TF_MESSAGE and not spans.odometry:
-            lookup.moving = bag.moving_frames(topics.odom_topic)
+            moving = bag.moving_frames(topics.odom_topic)
         damage = bag.truncated
         warnings = [*topics.notes(), *bag.repeated.notes(topics.range_topics, _choosing)]
         warnings += _warnings(bag, associator, lookup)
@@ -254,7 +116,7 @@ def read_drive(
             raise InputError(
                 f'{path} has no reading in the part {part}; its messages span {(last - first) / NANOSECONDS:.1f} s'
             )
-        error = _nothing_associated(associator, lookup, spans, undecodable, poses)
+        error = _nothing_associated(associator, lookup, spans, undecodable, poses, moving)
         # the rest of the messages may be in the part that cannot be read
         raise type(error)(f'{error}. {damage}') if damage else error
     first, last = associator.buffer.stamps
@@ -290,6 +152,12 @@ def _constant_transforms(path: Path | str, topics: Topics) -> StaticTransforms:
         return bag.constant_transforms_on_tf(topics)
 
 
+def _moving_transforms(path: Path | str, topics: Topics, base_frame: str, frame: str) -> MovingTransforms:
+    """Return the transforms between a sensor and the robot, in the same way."""
+    with Bag(path) as bag:
+        return bag.moving_transforms(topics, base_frame, frame)
+
+
 def _choosing(topics: Sequence[str]) -> str:
     return f'To use one of them, add `--range-topics {" ".join(map(quoted, topics))}`'
 
@@ -301,7 +169,6 @@ def _warnings(bag: Bag, associator: PoseAssociator, lookup: Extrinsics) -> list[
     for topic, count in bag.undecodable.items():
         warnings.append(skipped(count, topic))
     if associator.unknown_frames:
-        lookup.moving = bag.moving_frames()
         warnings.append(lookup.advice(associator.base_frame, sorted(associator.unknown_frames)))
     warnings += [*lookup.steep.values(), *lookup.notes, *far_mounts(lookup.poses)]
     if unused := lookup.unused:
@@ -336,13 +203,14 @@ def _nothing_associated(
     spans: Spans,
     undecodable: Mapping[str, int],
     poses: GivenPoses | None,
+    moving: Mapping[str, str],
 ) -> Exception:
     """Return the error with the reason why no reading got a pose, and a remedy."""
     ranges, odometry = spans.ranges, spans.odometry
     lost = '; '.join(f'{count} on {topic} do not fit their type' for topic, count in undecodable.items())
     if not ranges or not odometry:
-        if ranges and lookup.moving and not lookup.moving.keys() & set(BASE_FRAMES):
-            moved = ', '.join(f'{child} in {parent}' for child, parent in sorted(lookup.moving.items())[:12])
+        if ranges and moving and not moving.keys() & set(BASE_FRAMES):
+            moved = ', '.join(f'{child} in {parent}' for child, parent in sorted(moving.items())[:12])
             return BagError(
                 f'the transforms contain neither {" nor ".join(BASE_FRAMES)}, but {moved}; give the poses of the '
                 'robot with --poses, or record its Odometry'

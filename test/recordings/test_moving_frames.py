@@ -117,12 +117,62 @@ def test_frames_with_a_prefix_are_rejected_by_name(tmp_path: Path) -> None:
         read(path)
 
 
-@pytest.mark.parametrize(('frame', 'named'), [('servo', 'sonar on servo'), ('sonar', 'sonar')])
-def test_sensor_on_a_moving_joint_is_rejected(tmp_path: Path, frame: str, named: str) -> None:
-    servo = ('base_link', frame, lambda i: Pose2(0.1, 0.0, i / 10))
+@pytest.mark.parametrize('kind', ['mcap', 'ros1'])
+@pytest.mark.parametrize('frame', ['servo', 'sonar'])
+def test_sensor_on_a_moving_joint_is_placed_at_each_stamp(tmp_path: Path, frame: str, kind: str) -> None:
+    def turned(i: float) -> Pose2:
+        return Pose2(0.1 + i / 100, 0.02 * i, 3.0 + i / 10)
+
+    servo = ('base_link', frame, turned)
     fixed = ('servo', 'sonar') if frame == 'servo' else ('base_link', 'laser')
-    path = recorded(tmp_path / 'bag', [[('odom', 'base_link', at)], [servo]], fixed=fixed)
-    with pytest.raises(InputError, match=f'connect {named} to the robot: sensors on moving joints are not'):
+    path = recorded(
+        tmp_path / ('bag' if kind == 'mcap' else 'a.bag'), [[('odom', 'base_link', at), servo]], kind, fixed
+    )
+    drive = read(path)
+    readings = drive.associator.readings
+    assert len(readings) == 59 and not drive.source['warnings']
+    assert drive.source['mounts_from'] == 'moving transforms on /tf'
+    assert drive.source['extrinsics'] == {}
+    for i in range(59):
+        # the reading is a ten thousandth of the way to the next transforms
+        robot, joint = at(i + 1e-5), turned(i + 1e-5)
+        sensor = robot.compose(joint).compose(SENSOR if frame == 'servo' else Pose2(0.0, 0.0, 0.0))
+        assert (readings.x[i], readings.y[i]) == pytest.approx(sensor[:2], abs=1e-6)
+        assert math.remainder(readings.yaw[i] - sensor.yaw, math.tau) == pytest.approx(0.0, abs=1e-6)
+
+
+def test_readings_outside_the_time_of_a_joint_are_rejected(tmp_path: Path) -> None:
+    with TransformWriter(tmp_path / 'bag') as writer:
+        writer.write_static_transforms([('servo', 'sonar', SENSOR)], 0)
+        for i in range(60):
+            stamp = (i + 1) * SECOND // 10
+            writer.write_odometry('/odom', OdometryMessage(stamp, 'odom', 'base_link', at(i)))
+            if 10 <= i < 40 and i % 5 == 0:
+                writer.write_transforms([('base_link', 'servo', Pose2(0.1, 0.0, i / 40))], stamp)
+            writer.write_range('/sonar', RangeMessage(stamp, 'sonar', 1.0 + i / 64, 0.125, 5.0, 0.25))
+    drive = read(tmp_path / 'bag', None)
+    assert drive.associator.rejected == {'late_transform': 34}
+    readings = drive.associator.readings
+    for k, i in enumerate(range(10, 36)):
+        expected = at(i).compose(Pose2(0.1, 0.0, i / 40)).compose(SENSOR)
+        assert (readings.x[k], readings.y[k]) == pytest.approx(expected[:2])
+        assert math.remainder(readings.yaw[k] - expected.yaw, math.tau) == pytest.approx(0.0, abs=1e-9)
+
+
+def test_sensor_whose_joint_is_not_joined_to_the_robot_is_named(tmp_path: Path) -> None:
+    servo = ('arm', 'servo', lambda i: Pose2(0.1, 0.0, i / 10))
+    path = recorded(tmp_path / 'bag', [[('odom', 'base_link', at)], [servo]], fixed=('servo', 'sonar'))
+    with pytest.raises(
+        InputError, match=r'no pose on the robot \(frame base_link\) is known for sonar: .*--sensor sonar='
+    ):
+        read(path)
+
+
+def test_frame_with_two_parents_is_no_joint(tmp_path: Path) -> None:
+    servo = ('base_link', 'servo', lambda i: Pose2(0.1, 0.0, i / 10))
+    other = ('odom', 'servo', lambda i: Pose2(0.1, 0.0, i / 10))
+    path = recorded(tmp_path / 'bag', [[('odom', 'base_link', at)], [servo], [other]], fixed=('servo', 'sonar'))
+    with pytest.raises(InputError, match='no pose on the robot'):
         read(path)
 
 

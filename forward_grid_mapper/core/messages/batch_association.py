@@ -10,6 +10,7 @@ from __future__ import annotations
 import heapq
 import math
 from collections import Counter
+from collections.abc import Callable, Iterator
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -52,8 +53,23 @@ class BatchAssociator(PoseAssociator):
     In a batch, a result `Later` of `extrinsics` is final.
     """
 
-    def __init__(self, extrinsics: ExtrinsicsLookup, parameters: Parameters | None = None) -> None:
+    def __init__(
+        self,
+        extrinsics: ExtrinsicsLookup,
+        parameters: Parameters | None = None,
+        moves: Callable[[str, str], bool] = lambda base_frame, frame: False,
+    ) -> None:
+        """Prepare for messages.
+
+        Parameters
+        ----------
+        extrinsics, parameters
+            As of `PoseAssociator`.
+        moves : callable
+            Returns whether `extrinsics` depends on the stamp, for the frames of the robot and of a sensor.
+        """
         super().__init__(extrinsics, parameters, patient=True)
+        self._moves = moves
 
     def add_batch(self, batch: MessageBatch) -> None:
         """Take messages in the order in which they were recorded."""
@@ -159,19 +175,29 @@ class BatchAssociator(PoseAssociator):
         numbers, first = np.unique(waiting.frame[known], return_index=True)
         for number in numbers[np.argsort(first)].tolist():
             which = known[waiting.frame[known] == number]
-            mount = self._mount(frames[number], int(waiting.stamp[which[0]]))
-            if isinstance(mount, str):
-                measured.reason[which] = mount
-                continue
-            if isinstance(mount, Mount) and mount.elevation:
-                for column, values in zip(measured, project_all(measured.select(which), mount.elevation), strict=True):
-                    column[which] = values
-            sensors[which] = _composed(poses, which, mount)
+            for part, mount in self._mounts(frames[number], which, waiting.stamp):
+                if isinstance(mount, str):
+                    measured.reason[part] = mount
+                    continue
+                if isinstance(mount, Mount) and mount.elevation:
+                    projected = project_all(measured.select(part), mount.elevation)
+                    for column, values in zip(measured, projected, strict=True):
+                        column[part] = values
+                sensors[part] = _composed(poses, part, mount)
         kept = np.flatnonzero(measured.reason == '')
         measured.reason[kept] = self._extent.admit_all(sensors[kept], measured.select(kept), self._all)
         kept = np.flatnonzero(measured.reason == '')
         self._append(waiting.select(kept), sensors[kept], measured.select(kept), frames)
         return measured.reason
+
+    def _mounts(self, frame_id: str, which: Ints, stamp: Ints) -> Iterator[tuple[Ints, Pose2 | str]]:
+        """Yield readings of a sensor, and what `_mount` returns for all of them."""
+        mount = self._mount(frame_id, int(stamp[which[0]]))
+        if not self._moves(self.base_frame, frame_id):
+            yield which, mount
+            return
+        for k in which:
+            yield np.array([k]), self._mount(frame_id, int(stamp[k]))
 
     def _mount(self, frame_id: str, stamp: int) -> Pose2 | str:
         """Return the pose of a sensor on the robot, or the reason why its readings are rejected."""

@@ -16,7 +16,8 @@ FEWEST_READINGS = 200
 LEAST_ECHOES = 0.05
 """Fraction of the readings that must have an echo."""
 
-LEAST_SENSORS = 2
+ONE_WAY = 0.97
+"""Mean resultant length of the directions on the robot in which a single sensor looks, if it hardly turns."""
 
 
 def without_times(readings: Readings, odometry: Odometry) -> str:
@@ -42,6 +43,10 @@ def unfit(readings: Readings, odometry: Odometry) -> str:
         return f'the drive has {counted(len(readings), "reading")}; at least {FEWEST_READINGS} are needed'
     if readings.echo.mean() < LEAST_ECHOES:
         return f'only {readings.echo.mean():.0%} of the readings have an echo'
-    if len(np.unique(readings.sensor)) < LEAST_SENSORS:
-        return 'there is only one sensor, which cannot distinguish a rotation from a sideways translation'
+    directions = np.exp(1j * (readings.yaw - odometry.at(readings.stamp)[:, 2]))
+    if len(np.unique(readings.sensor)) == 1 and abs(directions.mean()) > ONE_WAY:
+        return (
+            'there is only one sensor, which is fixed to the robot and cannot distinguish a rotation from a sideways '
+            'translation'
+        )
     return ''

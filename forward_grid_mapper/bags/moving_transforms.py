@@ -1,0 +1,156 @@
+"""Poses of sensors on moving joints, such as a servo, from transforms that change; between two, as tf2 interpolates."""
+
+from __future__ import annotations
+
+import math
+from bisect import bisect_left
+from collections.abc import Collection
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..core.messages.extrinsics import LATE, Mount, mount_of
+from ..core.messages.message_types import stamp_of
+from ..core.messages.quaternions import rotation_of
+from .static_transforms import StaticTransforms, Transform, plain
+from .transform_chain import Numbers, numbers_of
+
+NEARLY_EQUAL = 0.9995
+"""Cosine of half the angle between two rotations from which they are interpolated on a straight line."""
+
+
+class _Joint:
+    """The poses of a frame in its parent, by stamp."""
+
+    def __init__(self, parent: str) -> None:
+        self.parent = parent
+        self._poses: dict[int, Numbers] = {}
+        self._stamps: list[int] = []
+
+    def add(self, stamp: int, numbers: Numbers) -> None:
+        self._poses[stamp] = numbers
+
+    def at(self, stamp: int) -> Transform | None:
+        """Return the pose at a stamp, nanoseconds; None before the first and after the last."""
+        if len(self._stamps) != len(self._poses):
+            self._stamps = sorted(self._poses)
+        after = bisect_left(self._stamps, stamp)
+        if after == len(self._stamps):
+            return None
+        last = self._stamps[after]
+        if last == stamp:
+            return _matrix(self._poses[last])
+        if not after:
+            return None
+        first = self._stamps[after - 1]
+        return _matrix(_between(self._poses[first], self._poses[last], (stamp - first) / (last - first)))
+
+
+class MovingTransforms:
+    """The transforms of a bag's `/tf`, and its static ones, which take precedence.
+
+    Parameters
+    ----------
+    fixed : StaticTransforms
+    frames : collection of str
+        Child frames whose transforms are kept; others are ignored.
+    """
+
+    def __init__(self, fixed: StaticTransforms, frames: Collection[str]) -> None:
+        self._fixed, self._frames = fixed, frames
+        self._joints: dict[str, _Joint] = {}
+        self._several: set[str] = set()
+
+    def add_message(self, message: Any) -> None:
+        """Add the transforms of a `tf2_msgs/TFMessage`; invalid ones are left out."""
+        for item in message.transforms:
+            parent, child = plain(str(item.header.frame_id)), plain(str(item.child_frame_id))
+            if child not in self._frames or parent == child:
+                continue
+            joint = self._joints.setdefault(child, _Joint(parent))
+            numbers = numbers_of(item.transform)
+            if joint.parent != parent:
+                self._several.add(child)
+            elif all(map(math.isfinite, numbers)) and rotation_of(*numbers[3:]) is not None:
+                joint.add(stamp_of(item.header), numbers)
+
+    def connects(self, base_frame: str, sensor_frame: str) -> bool:
+        """Return whether there is a way from the robot to a sensor, in which no frame has several parents."""
+        up, to_sensor = set(self._way(plain(base_frame))), self._way(plain(sensor_frame))
+        common = next((frame for frame in to_sensor if frame in up), None)
+        if common is None:
+            return False
+        way = [each for frame in (base_frame, sensor_frame) for each in self._below(plain(frame), common)]
+        return not self._several.intersection(way)
+
+    def lookup(self, base_frame: str, sensor_frame: str, stamp: int) -> Mount | str | None:
+        """Return the pose of the sensor on the robot at a stamp, nanoseconds.
+
+        Returns
+        -------
+        Mount, str or None
+            The reason why there is none at this stamp; None if the frames are not connected.
+        """
+        base_frame, sensor_frame = plain(base_frame), plain(sensor_frame)
+        up = set(self._way(base_frame))
+        common = next((frame for frame in self._way(sensor_frame) if frame in up), None)
+        if common is None:
+            return None
+        to_base, to_sensor = (self._pose_in(common, frame, stamp) for frame in (base_frame, sensor_frame))
+        if to_base is None or to_sensor is None:
+            return LATE.reason
+        pose = np.linalg.inv(to_base) @ to_sensor
+        return mount_of(float(pose[0, 3]), float(pose[1, 3]), pose[:3, 0].tolist())
+
+    def _parent(self, frame: str) -> str | None:
+        if (step := self._fixed.step(frame)) is not None:
+            return step[0]
+        return self._joints[frame].parent if frame in self._joints else None
+
+    def _way(self, frame: str) -> list[str]:
+        """Return the frame and its ancestors, nearest first."""
+        found: list[str] = []
+        at: str | None = frame
+        while at is not None and at not in found:
+            found.append(at)
+            at = self._parent(at)
+        return found
+
+    def _below(self, frame: str, common: str) -> list[str]:
+        way = self._way(frame)
+        return way[: way.index(common)]
+
+    def _pose_in(self, common: str, frame: str, stamp: int) -> NDArray[np.float64] | None:
+        """Return the pose of a frame in one of its ancestors; None if a joint has none at this stamp."""
+        whole = np.eye(4)
+        for each in self._below(frame, common):
+            step = self._fixed.step(each)
+            transform = self._joints[each].at(stamp) if step is None else step[1]
+            if transform is None:
+                return None
+            whole = transform @ whole
+        return whole
+
+
+def _between(one: Numbers, other: Numbers, part: float) -> Numbers:
+    """Interpolate linearly between two translations, and by slerp between two rotations."""
+    offset = tuple(a + part * (b - a) for a, b in zip(one[:3], other[:3], strict=True))
+    cosine = sum(a * b for a, b in zip(one[3:], other[3:], strict=True))
+    # a quaternion and its negative are the same rotation
+    sign = -1.0 if cosine < 0.0 else 1.0
+    if abs(cosine) > NEARLY_EQUAL:
+        first, last = 1.0 - part, part
+    else:
+        angle = math.acos(abs(cosine))
+        first, last = math.sin((1.0 - part) * angle) / math.sin(angle), math.sin(part * angle) / math.sin(angle)
+    turn = [first * a + sign * last * b for a, b in zip(one[3:], other[3:], strict=True)]
+    length = math.sqrt(sum(value * value for value in turn))
+    return (*offset, *(value / length for value in turn))
+
+
+def _matrix(numbers: Numbers) -> Transform:
+    made = np.eye(4)
+    made[:3, :3] = rotation_of(*numbers[3:])
+    made[:3, 3] = numbers[:3]
+    return made
