@@ -7,7 +7,7 @@ import threading
 import time
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
-from typing import Any
+from typing import Any, NamedTuple
 
 from ..core.common.errors import Cancelled
 from ..core.common.parameters import Parameters
@@ -34,8 +34,21 @@ from .trajectory import Trajectory
 LOG_PERIOD = 10.0
 """Seconds between two lines of progress in the log while the trajectory is estimated."""
 
+CHECKED_AGAIN = 2.0
+"""Factor by which the number of readings must grow before their consistency is checked again, which takes seconds."""
+
 LONG_WAIT = 0.5
 """Seconds of waiting for kernels from which the answer mentions them."""
+
+
+class _Checked(NamedTuple):
+    """The warnings of the last check of consistency, and what was checked."""
+
+    readings: int
+    extrinsics: Mapping[str, Pose2]
+    parameters: Parameters
+    found: list[str]
+
 
 RunInput = tuple[int, Readings, Any]
 """Number of readings accepted; those that are held; stamps and poses of odometry."""
@@ -116,6 +129,7 @@ class EmService:
         self._inbox, self._kernels, self._logger = inbox, kernels, logger
         self._watched = self._logged = 0.0
         self._generation = 0
+        self._checked: _Checked | None = None
         self.worker = EmWorker(self._watch, logger.error, inbox.put, self._wait_for_kernels)
 
     @property
@@ -222,6 +236,7 @@ class EmService:
         self._generation = self._publishers.generation
         self.maps, self.found, self.wrong_input, self.last_run = None, None, [], 'none since the reset'
         self.sensors.clear()
+        self._checked = None
 
     def close(self, seconds: float) -> None:
         """Cancel the current run, and wait at most so many seconds for its end."""
@@ -347,8 +362,11 @@ class EmService:
         self.last_run = '; '.join(said)
         self._logger.info(f'EM: {self.last_run}')
         # callers of EM are answered before this
-        fixed, generation = dict(self.extrinsics()), self._publishers.generation
-        self.worker.worker.put(lambda: self._check_consistency(maps, fixed, generation))
+        fixed, generation, last = dict(self.extrinsics()), self._publishers.generation, self._checked
+        if last and len(maps.readings) < CHECKED_AGAIN * last.readings and last[1:3] == (fixed, maps.parameters):
+            self.wrong_input = [*self.wrong_input, *last.found]
+        else:
+            self.worker.worker.put(lambda: self._check_consistency(maps, fixed, generation))
 
     def _check_consistency(self, maps: MapSet, fixed: Mapping[str, Pose2], generation: int) -> None:
         """Look for sensor poses and clock offsets that contradict the readings; in the worker's thread."""
@@ -356,12 +374,12 @@ class EmService:
 
         def take() -> None:
             if generation == self._publishers.generation and maps is self.maps:
+                self._checked = _Checked(len(maps.readings), fixed, maps.parameters, found)
                 self.wrong_input = [*self.wrong_input, *found]
                 for warning in found:
                     self._logger.warning(f'EM: {warning}')
 
-        if found:
-            self._inbox.put(take)
+        self._inbox.put(take)
 
     def _watch(self, run: Run) -> None:
         """Log progress and publish the map found so far, at most `publish_rate` times a second; in the run's thread."""

@@ -17,6 +17,7 @@ from em_robot import BEFORE, GRID, PROGRESS, SO_FAR, EmRobot
 
 from forward_grid_mapper.core.common.errors import InputError
 from forward_grid_mapper.core.common.parameters import Parameters
+from forward_grid_mapper.core.messages.message_types import Pose2
 from forward_grid_mapper.node import em_service
 
 
@@ -414,6 +415,29 @@ def test_contradictions_are_checked_after_the_response_and_logged(robot: EmRobot
         robot.em.maps = kept
         robot.publishers.generation = 3
     assert robot.node.warned == [] and len(robot.em.wrong_input) == 3
+
+
+def test_consistency_is_checked_again_when_the_readings_have_doubled(robot: EmRobot) -> None:
+    robot.contradictions = ['stamps are late']
+
+    def checks() -> int:
+        robot.node.warned.clear()
+        robot.run_em()
+        robot.settle()
+        assert robot.em.wrong_input == ['stamps are late']
+        return len(robot.checked)
+
+    assert checks() == 1
+    robot.accept(4)
+    assert checks() == 1 and 'EM: stamps are late' not in robot.node.warned
+    robot.accept(1)
+    assert checks() == 2
+    robot.parameters = Parameters.from_flat({'threads': 1})
+    assert checks() == 3
+    robot.em.extrinsics = lambda: {'sonar': Pose2(0.2, 0.0, 0.0)}
+    assert checks() == 4
+    robot.em.reset()
+    assert checks() == 5
 
 
 def test_closing_cancels_the_run(held: EmRobot) -> None:

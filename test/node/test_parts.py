@@ -117,6 +117,7 @@ def test_contradictory_poses_are_reported_after_the_response(
     assert 'stamps are late' in str(robot.status('readings'))
     # results for deleted maps are dropped
     go_on.clear()
+    robot.drive(60, 200)
     assert robot.call(node.em.run_em)[0]
     robot.until(lambda: len(checked) == 2)
     robot.call(node.reset)
