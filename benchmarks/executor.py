@@ -258,9 +258,10 @@ def measure(options: argparse.Namespace, folder: Path) -> None:
         end = time.monotonic() + seconds
         return lambda: load.until(lambda: time.monotonic() > end, seconds + 60)
 
-    def set_parameter(name: str, value: float) -> None:
-        given = Parameter(name=name, value=ParameterValue(type=3, double_value=value))
-        load.call(SetParameters, 'set_parameters', parameters=[given])
+    def set_parameters() -> None:
+        for k in range(20):
+            given = Parameter(name='p_hit', value=ParameterValue(type=3, double_value=0.5 + 0.01 * k))
+            load.call(SetParameters, 'set_parameters', parameters=[given])
 
     answers: list[str] = []
     try:
@@ -272,7 +273,7 @@ def measure(options: argparse.Namespace, folder: Path) -> None:
         phase('EM', lambda: answers.append(load.call(Trigger, 'run_em').message))
         phase('50 maps', lambda: [load.call(GetMap, f'get_{name}') for name in ['live_map', 'ml_map'] * 25])
         phase('maps are saved', lambda: answers.append(load.call(Trigger, 'save_maps').message[:60]))
-        phase('parameters change', lambda: [set_parameter('p_hit', 0.5 + 0.01 * k) for k in range(20)])
+        phase('parameters change', set_parameters)
         phase('driving on', wait(options.seconds))
         phase('reset', lambda: answers.append(load.call(Trigger, 'reset').message))
         phase('driving on after it', wait(5.0))

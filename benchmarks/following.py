@@ -16,7 +16,7 @@ import argparse
 import time
 
 import numpy as np
-from trajectories import LEVELS, ROBOTS, odometry_of, worlds
+from trajectories import ROBOTS, worlds
 
 from forward_grid_mapper.core.common.parameters import Parameters
 from forward_grid_mapper.core.common.readings import Floats, Readings
@@ -27,7 +27,7 @@ from forward_grid_mapper.core.trajectory.poses import compose, inverse
 from forward_grid_mapper.core.trajectory.refinement import Refiner
 from forward_grid_mapper.core.trajectory.windows import Odometry
 from forward_grid_mapper.core.warm_up import warm_up
-from forward_grid_mapper.simulation.drift import with_drift
+from forward_grid_mapper.simulation.drift import LEVELS, odometry_of, with_drift
 from forward_grid_mapper.simulation.drive import drive
 
 EVERY, MOST = 20.0, 100.0

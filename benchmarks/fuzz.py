@@ -35,6 +35,7 @@ from forward_grid_mapper.core.common.errors import MapperError
 from forward_grid_mapper.core.common.parameters import TABLE
 from forward_grid_mapper.core.mapping import Mapper
 from forward_grid_mapper.node import frames
+from forward_grid_mapper.node.deferred import Reply
 from forward_grid_mapper.node.map_publishers import MAPS
 from forward_grid_mapper.node.mapper_node import MapperNode
 
@@ -63,7 +64,7 @@ def require(condition: bool, what: str) -> None:
         raise Broken(what)
 
 
-class Answer:
+class Answer(Reply):
     """A reply of a service without a client."""
 
     def __init__(self, request: Any = None) -> None:
@@ -82,7 +83,7 @@ class Fuzz:
         self.hostile = Hostile(seed)
         self.rejected: Counter[str] = Counter()
         self.sent = self.total = self.accepted = self.parameters_refused = self.parameters_set = 0
-        frames.Transforms.of = classmethod(  # type: ignore[method-assign]
+        frames.Transforms.of = classmethod(  # type: ignore[assignment, method-assign]
             lambda cls, node: cls(self.hostile, TransformFailed)
         )
         overrides = {**OVERRIDES, 'save_directory': str(folder / 'maps'), 'journal': str(folder / 'journal')}

@@ -116,7 +116,7 @@ class Plan:
         bottom, top = min(near, back), max(near, back)
         self.floors += [(low, bottom, high, top), (at, min(side, near), at + door, max(side, near))]
         self.rooms.append((low, bottom, high, top))
-        self._furnish((low, bottom, high, top), rng.integers(1, 6))
+        self._furnish((low, bottom, high, top), int(rng.integers(1, 6)))
 
     def _hall(self, x: float, width: float) -> None:
         """Draw a hall of random width at the end of the corridor."""
@@ -129,7 +129,7 @@ class Plan:
         self.face(x + long, low, x + long, high)
         self.floors.append((x, low, x + long, high))
         self.rooms.append((x, low, x + long, high))
-        self._furnish((x, low, x + long, high), rng.integers(2, 7))
+        self._furnish((x, low, x + long, high), int(rng.integers(2, 7)))
 
     def _furnish(self, room: tuple[float, float, float, float], count: int) -> None:
         rng = self.rng
@@ -164,7 +164,7 @@ def physics_of(rng: np.random.Generator) -> Physics:
 def _rays(plan: Plan, turn: float) -> Floats:
     c, s = math.cos(turn), math.sin(turn)
     ends = np.array(plan.segments).reshape(-1, 2) @ np.array([[c, s], [-s, c]])
-    return ends.reshape(-1, 4)
+    return np.asarray(ends.reshape(-1, 4))
 
 
 def way_through(plan: Plan, rng: np.random.Generator) -> Floats:

@@ -19,6 +19,7 @@ import subprocess
 import sys
 import time
 from pathlib import Path
+from typing import Any
 
 os.environ.setdefault('ROS_AUTOMATIC_DISCOVERY_RANGE', 'LOCALHOST')
 os.environ['ROS_DOMAIN_ID'] = str(os.getpid() % 100)
@@ -75,7 +76,7 @@ class Load:
                 if f'readings {key}' in values:
                     self.counts[key] = int(values[f'readings {key}'])
 
-    def stamp(self, header: object) -> None:
+    def stamp(self, header: Any) -> None:
         """Set the stamp of a message to the current time."""
         header.stamp.sec, header.stamp.nanosec = divmod(time.time_ns(), 1_000_000_000)
 

@@ -21,9 +21,6 @@ from forward_grid_mapper.core.evidence.evidence import Evidence
 from forward_grid_mapper.core.search.search import Search
 from forward_grid_mapper.core.sensor.forward_model import log_likelihood
 
-INDEPENDENT = {'end_cost': 0.0}
-"""Cells are independent, as in the exhaustive search here."""
-
 
 def random_readings(rng: np.random.Generator, grid: Grid, count: int) -> Readings:
     """Return readings at random poses in the grid, one in four without echo."""
@@ -61,7 +58,7 @@ def main() -> None:
                 readings = random_readings(np.random.default_rng(seed), grid, options.readings)
                 evidence = Evidence(grid, model)
                 evidence.extend(readings)
-                Search(evidence, SearchParameters(prior=prior, **INDEPENDENT)).run()
+                Search(evidence, SearchParameters(prior=prior, end_cost=0.0)).run()
                 cells = evidence.state.maps.occupied
                 ours = log_likelihood(readings, grid, cells.reshape(grid.shape), model) + logit * int(cells.sum())
                 short.append(best_of_all(readings, grid, model, logit) - ours)

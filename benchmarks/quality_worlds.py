@@ -26,7 +26,7 @@ from forward_grid_mapper.simulation.sonar import NOISY, NoiseModel, SonarArray, 
 from forward_grid_mapper.simulation.world import Floorplan, World, rooms_world
 
 SHARED = Path(__file__).resolve().parents[2] / 'shared'
-RECORDINGS = ('office_a', 'office_b')
+RECORDINGS: tuple[str, ...] = ('office_a', 'office_b')
 ODOMETRY = '/odom_corrected'
 DEPTH = 0.2
 """Metres behind the nearest wall of a cone beyond which a wall is not visible."""

@@ -114,7 +114,7 @@ def cave() -> Place:
 
     def waves(mean: float, size: float, most: int) -> Floats:
         terms = [rng.normal() * size / k * np.cos(k * angle + rng.uniform(0.0, 6.28)) for k in range(1, most)]
-        return mean + np.sum(terms, axis=0)
+        return np.asarray(mean + np.sum(terms, axis=0))
 
     outer, inner = waves(7.0, 1.3, 9), waves(3.0, 0.45, 7)
     rock, pillar, middle = (

@@ -74,7 +74,9 @@ def messages(tours: int) -> Iterator[RangeMessage | OdometryMessage]:
     for seed in range(tours):
         drive = corridor_drive(seed, passes=2)
         last = 0
-        for message in heapq.merge(drive.odometry, drive.ranges, key=lambda m: m.stamp):
+        both: Iterator[RangeMessage | OdometryMessage]
+        both = heapq.merge(drive.odometry, drive.ranges, key=lambda message: message.stamp)
+        for message in both:
             last = message.stamp
             yield message._replace(stamp=last + shift)
         shift += last - drive.odometry[0].stamp + NANOSECONDS // 50

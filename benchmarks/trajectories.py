@@ -45,7 +45,7 @@ from forward_grid_mapper.simulation.drift import LEVELS, drifted, odometry_of, w
 from forward_grid_mapper.simulation.drive import Recording, drive
 from forward_grid_mapper.simulation.score import SURFACE_DEPTH, score_map, visible_surface
 from forward_grid_mapper.simulation.sonar import NoiseModel, SonarArray, front_array, sonar_ring
-from forward_grid_mapper.simulation.world import Floorplan, World, building_tour, building_world
+from forward_grid_mapper.simulation.world import Axis, Floorplan, World, building_tour, building_world
 
 
 def octagon() -> SonarArray:
@@ -54,7 +54,7 @@ def octagon() -> SonarArray:
     return dataclasses.replace(ring, yaws=tuple(yaw + math.pi / 8 for yaw in ring.yaws))
 
 
-ROBOTS = {
+ROBOTS: dict[str, tuple[Callable[[], SonarArray], float, NoiseModel]] = {
     'ring': (lambda: sonar_ring(16), 0.1, NoiseModel(0.02, 0.01, 0.0)),
     'octagon': (octagon, 0.1, NoiseModel(0.03, 0.04, 0.05)),
     'front': (front_array, 0.1, NoiseModel(0.03, 0.04, 0.05)),
@@ -90,8 +90,12 @@ def corridors(seed: int, legs: int) -> tuple[World, np.ndarray]:
     plan.box(low, high)
     outer = low[0] + deep, low[1] + deep, high[0] - deep, high[1] - deep
     inner = outer[0] + across, outer[1] + across, outer[2] - across, outer[3] - across
-    sides = (('x', outer[1], outer[0], outer[2], low[1]), ('y', outer[2], outer[1], outer[3], high[0]))
-    sides += (('x', outer[3], outer[0], outer[2], high[1]), ('y', outer[0], outer[1], outer[3], low[0]))
+    sides: list[tuple[Axis, int, int, int, int]] = [
+        ('x', outer[1], outer[0], outer[2], low[1]),
+        ('y', outer[2], outer[1], outer[3], high[0]),
+        ('x', outer[3], outer[0], outer[2], high[1]),
+        ('y', outer[0], outer[1], outer[3], low[0]),
+    ]
     for axis, wall, begin, end, back in sides:
         at, doors = begin, []
         while at < end - 30:
