@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..core.messages.extrinsics import LATE, Mount, mount_of
-from ..core.messages.message_types import stamp_of
+from ..core.messages.message_types import NANOSECONDS, stamp_of
 from ..core.messages.quaternions import rotation_of
 from .static_transforms import StaticTransforms, Transform, plain
 from .transform_chain import Numbers, numbers_of
@@ -21,10 +21,10 @@ NEARLY_EQUAL = 0.9995
 
 
 class _Joint:
-    """The poses of a frame in its parent, by stamp."""
+    """The poses of a frame in its parent, by stamp; they are interpolated over at most `longest` nanoseconds."""
 
-    def __init__(self, parent: str) -> None:
-        self.parent = parent
+    def __init__(self, parent: str, longest: float) -> None:
+        self.parent, self._longest = parent, longest
         self._poses: dict[int, Numbers] = {}
         self._stamps: list[int] = []
 
@@ -32,7 +32,7 @@ class _Joint:
         self._poses[stamp] = numbers
 
     def at(self, stamp: int) -> Transform | None:
-        """Return the pose at a stamp, nanoseconds; None before the first and after the last."""
+        """Return the pose at a stamp, nanoseconds; None before the first, after the last, and in a long gap."""
         if len(self._stamps) != len(self._poses):
             self._stamps = sorted(self._poses)
         after = bisect_left(self._stamps, stamp)
@@ -44,6 +44,8 @@ class _Joint:
         if not after:
             return None
         first = self._stamps[after - 1]
+        if last - first > self._longest:
+            return None
         return _matrix(_between(self._poses[first], self._poses[last], (stamp - first) / (last - first)))
 
 
@@ -55,10 +57,13 @@ class MovingTransforms:
     fixed : StaticTransforms
     frames : collection of str
         Child frames whose transforms are kept; others are ignored.
+    longest_gap : float
+        Longest time between two transforms of a frame for interpolation, seconds.
     """
 
-    def __init__(self, fixed: StaticTransforms, frames: Collection[str]) -> None:
+    def __init__(self, fixed: StaticTransforms, frames: Collection[str], longest_gap: float = math.inf) -> None:
         self._fixed, self._frames = fixed, frames
+        self._longest = longest_gap * NANOSECONDS
         self._joints: dict[str, _Joint] = {}
         self._several: set[str] = set()
 
@@ -68,7 +73,7 @@ class MovingTransforms:
             parent, child = plain(str(item.header.frame_id)), plain(str(item.child_frame_id))
             if child not in self._frames or parent == child:
                 continue
-            joint = self._joints.setdefault(child, _Joint(parent))
+            joint = self._joints.setdefault(child, _Joint(parent, self._longest))
             numbers = numbers_of(item.transform)
             if joint.parent != parent:
                 self._several.add(child)

@@ -273,8 +273,13 @@ class Bag:
         transforms.take(self.static_transforms(topics))
         return transforms
 
-    def moving_transforms(self, topics: Topics, base_frame: str, sensor_frame: str) -> MovingTransforms:
-        """Return the transforms by stamp that may connect a sensor to the robot: those on `/tf`, and static ones."""
+    def moving_transforms(
+        self, topics: Topics, base_frame: str, sensor_frame: str, longest_gap: float
+    ) -> MovingTransforms:
+        """Return the transforms by stamp that may connect a sensor to the robot: those on `/tf`, and static ones.
+
+        `longest_gap` is that of `MovingTransforms`, seconds.
+        """
         fixed = self.static_transforms(topics)
         parents, ways = self.moving_frames(), []
         for frame in (sensor_frame, base_frame):
@@ -286,7 +291,7 @@ class Bag:
                 at = parents.get(at) if step is None else step[0]
             ways.append(way)
         # what is above both does not matter
-        moving = MovingTransforms(fixed, set(ways[0]).symmetric_difference(ways[1]))
+        moving = MovingTransforms(fixed, set(ways[0]).symmetric_difference(ways[1]), longest_gap)
         for channel, message in self._decoded({(topic, TF_MESSAGE) for topic in self.moving_topics()}):
             if message is None:
                 continue

@@ -159,6 +159,22 @@ def test_readings_outside_the_time_of_a_joint_are_rejected(tmp_path: Path) -> No
         assert math.remainder(readings.yaw[k] - expected.yaw, math.tau) == pytest.approx(0.0, abs=1e-9)
 
 
+def test_readings_in_a_gap_of_a_joint_are_rejected(tmp_path: Path) -> None:
+    with TransformWriter(tmp_path / 'bag') as writer:
+        for i in range(100):
+            stamp = (i + 1) * SECOND // 10
+            writer.write_odometry('/odom', OdometryMessage(stamp, 'odom', 'base_link', at(i)))
+            # the gaps are 2 s and 2.1 s
+            if i in (0, 20) or i >= 41:
+                writer.write_transforms([('base_link', 'sonar', Pose2(0.1, 0.0, i / 40))], stamp)
+            writer.write_range('/sonar', RangeMessage(stamp, 'sonar', 1.0 + i / 64, 0.125, 5.0, 0.25))
+    drive = read(tmp_path / 'bag', None)
+    assert drive.associator.rejected == {'late_transform': 20}
+    # the node waits as long
+    patient = read_drive(tmp_path / 'bag', Parameters.from_flat({'pose_timeout': 2.1}), {})
+    assert not patient.associator.rejected
+
+
 def test_sensor_whose_joint_is_not_joined_to_the_robot_is_named(tmp_path: Path) -> None:
     servo = ('arm', 'servo', lambda i: Pose2(0.1, 0.0, i / 10))
     path = recorded(tmp_path / 'bag', [[('odom', 'base_link', at)], [servo]], fixed=('servo', 'sonar'))
