@@ -184,6 +184,30 @@ def test_sensor_whose_joint_is_not_joined_to_the_robot_is_named(tmp_path: Path) 
         read(path)
 
 
+def test_transforms_are_searched_once_for_all_sensors_without_a_pose(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with TransformWriter(tmp_path / 'bag') as writer:
+        for i in range(50):
+            stamp = (i + 1) * SECOND // 10
+            writer.write_transforms([('odom', 'base_link', at(i)), ('arm', 'servo', at(i))], stamp)
+            for k in range(8):
+                writer.write_range(f'/sonar{k}', RangeMessage(stamp, f'sonar{k}', 1.0, 0.125, 5.0, 0.25))
+    decoded = []
+    original = Bag._decoded
+
+    def counting(self: Bag, *args: Any) -> Any:
+        for channel, message in original(self, *args):
+            decoded.append(channel.topic)
+            yield channel, message
+
+    monkeypatch.setattr(Bag, '_decoded', counting)
+    with pytest.raises(InputError, match='is known for sonar0, sonar1, sonar2'):
+        read(tmp_path / 'bag', '/tf')
+    # for the chain of the robot's pose, the constant transforms and the parents
+    assert decoded.count('/tf') == 3 * 50
+
+
 def test_frame_with_two_parents_is_no_joint(tmp_path: Path) -> None:
     servo = ('base_link', 'servo', lambda i: Pose2(0.1, 0.0, i / 10))
     other = ('odom', 'servo', lambda i: Pose2(0.1, 0.0, i / 10))
