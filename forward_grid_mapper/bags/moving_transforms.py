@@ -65,7 +65,7 @@ class MovingTransforms:
         self._fixed, self._frames = fixed, frames
         self._longest = longest_gap * NANOSECONDS
         self._joints: dict[str, _Joint] = {}
-        self._several: set[str] = set()
+        self._several: dict[str, str] = {}
 
     def add_message(self, message: Any) -> None:
         """Add the transforms of a `tf2_msgs/TFMessage`; invalid ones are left out."""
@@ -76,7 +76,7 @@ class MovingTransforms:
             joint = self._joints.setdefault(child, _Joint(parent, self._longest))
             numbers = numbers_of(item.transform)
             if joint.parent != parent:
-                self._several.add(child)
+                self._several.setdefault(child, parent)
             elif all(map(math.isfinite, numbers)) and rotation_of(*numbers[3:]) is not None:
                 joint.add(stamp_of(item.header), numbers)
 
@@ -87,7 +87,18 @@ class MovingTransforms:
         if common is None:
             return False
         way = [each for frame in (base_frame, sensor_frame) for each in self._below(plain(frame), common)]
-        return not self._several.intersection(way)
+        return self._several.keys().isdisjoint(way)
+
+    def doubt(self, base_frame: str, sensor_frame: str) -> str:
+        """Return which frame above the robot or a sensor has several parents, in words; '' if none has."""
+        above = [*self._way(plain(sensor_frame)), *self._way(plain(base_frame))]
+        frame = next((each for each in above if each in self._several), None)
+        if frame is None:
+            return ''
+        return (
+            f'/tf has {frame} in two frames, {self._joints[frame].parent} and {self._several[frame]}: a frame has one '
+            'parent; stop one of the publishers.'
+        )
 
     def lookup(self, base_frame: str, sensor_frame: str, stamp: int) -> Mount | str | None:
         """Return the pose of the sensor on the robot at a stamp, nanoseconds.

@@ -291,7 +291,7 @@ class Bag:
                 at = parents.get(at) if step is None else step[0]
             ways.append(way)
         # what is above both does not matter
-        joined = not set(ways[0]).isdisjoint(ways[1])
+        joined = not set(ways[0]).isdisjoint((*ways[1], *parents))
         moving = MovingTransforms(fixed, set(ways[0]).symmetric_difference(ways[1]), longest_gap)
         # it takes long to read all transforms of a long drive
         for channel, message in self._decoded({(topic, TF_MESSAGE) for topic in self.moving_topics() if joined}):

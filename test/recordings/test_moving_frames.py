@@ -159,6 +159,31 @@ def test_readings_outside_the_time_of_a_joint_are_rejected(tmp_path: Path) -> No
         assert math.remainder(readings.yaw[k] - expected.yaw, math.tau) == pytest.approx(0.0, abs=1e-9)
 
 
+def test_base_that_is_itself_on_the_frame_of_a_joint(tmp_path: Path) -> None:
+    """The robot's base may be a child of the frame that carries the servo, even a moving one."""
+
+    def lifted(i: float) -> Pose2:
+        return Pose2(0.2 - i / 200, 0.1, 0.3 + i / 100)
+
+    with TransformWriter(tmp_path / 'bag') as writer:
+        writer.write_static_transforms([('servo', 'sonar', SENSOR)], 0)
+        for i in range(60):
+            stamp = (i + 1) * SECOND // 10
+            writer.write_odometry('/odom', OdometryMessage(stamp, 'odom', 'base_footprint', at(i)))
+            servo = ('base_link', 'servo', Pose2(0.1, 0.0, i / 40))
+            writer.write_transforms([('base_link', 'base_footprint', lifted(i)), servo], stamp)
+            writer.write_range('/sonar', RangeMessage(stamp, 'sonar', 1.0 + i / 64, 0.125, 5.0, 0.25))
+    readings = read(tmp_path / 'bag', None).associator.readings
+    assert len(readings) == 60
+    for i in range(60):
+        base = lifted(i)
+        c, s = math.cos(base.yaw), math.sin(base.yaw)
+        inverse = Pose2(-c * base.x - s * base.y, s * base.x - c * base.y, -base.yaw)
+        expected = at(i).compose(inverse).compose(Pose2(0.1, 0.0, i / 40)).compose(SENSOR)
+        assert (readings.x[i], readings.y[i]) == pytest.approx(expected[:2])
+        assert math.remainder(readings.yaw[i] - expected.yaw, math.tau) == pytest.approx(0.0, abs=1e-9)
+
+
 def test_readings_in_a_gap_of_a_joint_are_rejected(tmp_path: Path) -> None:
     with TransformWriter(tmp_path / 'bag') as writer:
         for i in range(100):
@@ -210,10 +235,22 @@ def test_transforms_are_searched_once_for_all_sensors_without_a_pose(
 
 def test_frame_with_two_parents_is_no_joint(tmp_path: Path) -> None:
     servo = ('base_link', 'servo', lambda i: Pose2(0.1, 0.0, i / 10))
-    other = ('odom', 'servo', lambda i: Pose2(0.1, 0.0, i / 10))
-    path = recorded(tmp_path / 'bag', [[('odom', 'base_link', at)], [servo], [other]], fixed=('servo', 'sonar'))
-    with pytest.raises(InputError, match='no pose on the robot'):
-        read(path)
+    for name in ('odom', 'mast'):
+        other = (name, 'servo', lambda i: Pose2(0.1, 0.0, i / 10))
+        path = recorded(tmp_path / name, [[('odom', 'base_link', at)], [servo], [other]], fixed=('servo', 'sonar'))
+        named = f'/tf has servo in two frames, base_link and {name}: a frame has one parent'
+        with pytest.raises(InputError, match=f'no pose on the robot.* {named}'):
+            read(path)
+
+
+def test_robot_with_two_parents_has_no_joint(tmp_path: Path) -> None:
+    links = [[('odom', 'base_link', at)], [('base_footprint', 'base_link', at)], [('odom', 'base_footprint', at)]]
+    servo = ('odom', 'servo', lambda i: Pose2(0.1, 0.0, i / 10))
+    path = recorded(tmp_path / 'bag', [*links, [servo]], fixed=('servo', 'sonar'))
+    with Bag(path) as bag:
+        topics = bag.choose_topics(None, 'tf', any_poses=True)
+        moving = bag.moving_transforms(topics, bag.moving_frames(), 'base_link', 'sonar', 2.0)
+    assert not moving.connects('base_link', 'sonar')
 
 
 @pytest.mark.parametrize('kind', ['mcap', 'ros1'])
