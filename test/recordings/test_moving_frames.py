@@ -15,7 +15,7 @@ from forward_grid_mapper.bags.writer import BagWriter
 from forward_grid_mapper.core.common.errors import BagError, InputError
 from forward_grid_mapper.core.common.parameters import Parameters
 from forward_grid_mapper.core.messages.message_types import OdometryMessage, Pose2, RangeMessage
-from forward_grid_mapper.recordings.drive import Drive
+from forward_grid_mapper.recordings.drive import Drive, Part
 from forward_grid_mapper.recordings.read_drive import read_drive
 
 SECOND = 1_000_000_000
@@ -157,6 +157,27 @@ def test_readings_outside_the_time_of_a_joint_are_rejected(tmp_path: Path) -> No
         expected = at(i).compose(Pose2(0.1, 0.0, i / 40)).compose(SENSOR)
         assert (readings.x[k], readings.y[k]) == pytest.approx(expected[:2])
         assert math.remainder(readings.yaw[k] - expected.yaw, math.tau) == pytest.approx(0.0, abs=1e-9)
+
+
+def test_given_pose_takes_precedence_over_a_joint(tmp_path: Path) -> None:
+    servo = ('base_link', 'servo', lambda i: Pose2(0.1, 0.0, i / 10))
+    path = recorded(tmp_path / 'bag', [[('odom', 'base_link', at), servo]], fixed=('servo', 'sonar'))
+    given = Pose2(0.3, 0.0, 1.0)
+    drive = read_drive(path, Parameters(), {'sonar': given}, None, 'tf')
+    assert drive.source['mounts_from'] == 'parameters' and drive.source['extrinsics'] == {'sonar': given}
+    assert drive.associator.readings.yaw[30] == pytest.approx(at(30 + 1e-5).yaw + 1.0, abs=1e-6)
+
+
+@pytest.mark.parametrize('offset', [-2.0, 2.0])
+def test_part_of_a_drive_has_the_odometry_for_its_shifted_stamps(tmp_path: Path, offset: float) -> None:
+    with BagWriter(tmp_path / 'bag') as writer:
+        for i in range(100):
+            stamp = (i + 1) * SECOND // 10
+            writer.write_odometry('/odom', OdometryMessage(stamp, 'odom', 'base_link', at(i)))
+            writer.write_range('/sonar', RangeMessage(stamp, 'sonar', 1.0 + i / 64, 0.125, 5.0, 0.25))
+    parameters = Parameters.from_flat({'range_time_offset': offset, 'max_pose_gap': 0.2})
+    drive = read_drive(tmp_path / 'bag', parameters, {'sonar': SENSOR}, part=Part(4.0, 2.0))
+    assert len(drive.associator.readings) == 20 and not drive.associator.rejected
 
 
 def test_base_that_is_itself_on_the_frame_of_a_joint(tmp_path: Path) -> None:
