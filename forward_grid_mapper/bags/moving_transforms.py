@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..core.messages.extrinsics import LATE, Mount, mount_of
-from ..core.messages.message_types import stamp_of
+from ..core.messages.message_types import NANOSECONDS, stamp_of
 from ..core.messages.quaternions import rotation_of
 from .static_transforms import StaticTransforms, Transform, plain
 from .transform_chain import Numbers, numbers_of
@@ -21,10 +21,10 @@ NEARLY_EQUAL = 0.9995
 
 
 class _Joint:
-    """The poses of a frame in its parent, by stamp."""
+    """The poses of a frame in its parent, by stamp; they are interpolated over at most `longest` nanoseconds."""
 
-    def __init__(self, parent: str) -> None:
-        self.parent = parent
+    def __init__(self, parent: str, longest: float) -> None:
+        self.parent, self._longest = parent, longest
         self._poses: dict[int, Numbers] = {}
         self._stamps: list[int] = []
 
@@ -32,7 +32,7 @@ class _Joint:
         self._poses[stamp] = numbers
 
     def at(self, stamp: int) -> Transform | None:
-        """Return the pose at a stamp, nanoseconds; None before the first and after the last."""
+        """Return the pose at a stamp, nanoseconds; None before the first, after the last, and in a long gap."""
         if len(self._stamps) != len(self._poses):
             self._stamps = sorted(self._poses)
         after = bisect_left(self._stamps, stamp)
@@ -44,6 +44,8 @@ class _Joint:
         if not after:
             return None
         first = self._stamps[after - 1]
+        if last - first > self._longest:
+            return None
         return _matrix(_between(self._poses[first], self._poses[last], (stamp - first) / (last - first)))
 
 
@@ -55,12 +57,15 @@ class MovingTransforms:
     fixed : StaticTransforms
     frames : collection of str
         Child frames whose transforms are kept; others are ignored.
+    longest_gap : float
+        Longest time between two transforms of a frame for interpolation, seconds.
     """
 
-    def __init__(self, fixed: StaticTransforms, frames: Collection[str]) -> None:
+    def __init__(self, fixed: StaticTransforms, frames: Collection[str], longest_gap: float = math.inf) -> None:
         self._fixed, self._frames = fixed, frames
+        self._longest = longest_gap * NANOSECONDS
         self._joints: dict[str, _Joint] = {}
-        self._several: set[str] = set()
+        self._several: dict[str, str] = {}
 
     def add_message(self, message: Any) -> None:
         """Add the transforms of a `tf2_msgs/TFMessage`; invalid ones are left out."""
@@ -68,10 +73,10 @@ class MovingTransforms:
             parent, child = plain(str(item.header.frame_id)), plain(str(item.child_frame_id))
             if child not in self._frames or parent == child:
                 continue
-            joint = self._joints.setdefault(child, _Joint(parent))
+            joint = self._joints.setdefault(child, _Joint(parent, self._longest))
             numbers = numbers_of(item.transform)
             if joint.parent != parent:
-                self._several.add(child)
+                self._several.setdefault(child, parent)
             elif all(map(math.isfinite, numbers)) and rotation_of(*numbers[3:]) is not None:
                 joint.add(stamp_of(item.header), numbers)
 
@@ -82,7 +87,18 @@ class MovingTransforms:
         if common is None:
             return False
         way = [each for frame in (base_frame, sensor_frame) for each in self._below(plain(frame), common)]
-        return not self._several.intersection(way)
+        return self._several.keys().isdisjoint(way)
+
+    def doubt(self, base_frame: str, sensor_frame: str) -> str:
+        """Return which frame above the robot or a sensor has several parents, in words; '' if none has."""
+        above = [*self._way(plain(sensor_frame)), *self._way(plain(base_frame))]
+        frame = next((each for each in above if each in self._several), None)
+        if frame is None:
+            return ''
+        return (
+            f'/tf has {frame} in two frames, {self._joints[frame].parent} and {self._several[frame]}: a frame has one '
+            'parent; stop one of the publishers.'
+        )
 
     def lookup(self, base_frame: str, sensor_frame: str, stamp: int) -> Mount | str | None:
         """Return the pose of the sensor on the robot at a stamp, nanoseconds.

@@ -273,10 +273,15 @@ class Bag:
         transforms.take(self.static_transforms(topics))
         return transforms
 
-    def moving_transforms(self, topics: Topics, base_frame: str, sensor_frame: str) -> MovingTransforms:
-        """Return the transforms by stamp that may connect a sensor to the robot: those on `/tf`, and static ones."""
+    def moving_transforms(
+        self, topics: Topics, parents: Mapping[str, str], base_frame: str, sensor_frame: str, longest_gap: float
+    ) -> MovingTransforms:
+        """Return the transforms by stamp that may connect a sensor to the robot: those on `/tf`, and static ones.
+
+        `parents` are those of `moving_frames`, and `longest_gap` is that of `MovingTransforms`, seconds.
+        """
         fixed = self.static_transforms(topics)
-        parents, ways = self.moving_frames(), []
+        ways = []
         for frame in (sensor_frame, base_frame):
             way: list[str] = []
             at: str | None = plain(frame)
@@ -286,8 +291,10 @@ class Bag:
                 at = parents.get(at) if step is None else step[0]
             ways.append(way)
         # what is above both does not matter
-        moving = MovingTransforms(fixed, set(ways[0]).symmetric_difference(ways[1]))
-        for channel, message in self._decoded({(topic, TF_MESSAGE) for topic in self.moving_topics()}):
+        joined = not set(ways[0]).isdisjoint((*ways[1], *parents))
+        moving = MovingTransforms(fixed, set(ways[0]).symmetric_difference(ways[1]), longest_gap)
+        # it takes long to read all transforms of a long drive
+        for channel, message in self._decoded({(topic, TF_MESSAGE) for topic in self.moving_topics() if joined}):
             if message is None:
                 continue
             try:

@@ -110,6 +110,8 @@ class Extrinsics:
         if known is None:
             known = self._joints(base_frame, frame)
             if not known.connects(base_frame, frame):
+                if doubt := known.doubt(base_frame, frame):
+                    self.unusable[frame] = doubt
                 return False
             self._read.append(known)
         self._on_joints[base_frame, frame] = known
@@ -136,8 +138,10 @@ class Extrinsics:
         joined = f'/tf_static connects {", ".join(known[:12])}' if known else NO_STATIC
         if not base_frame:
             joined += '; odometry has no child_frame_id, which is needed to look up transforms'
-        reasons = ''.join(f' {self.unusable[frame]}' for frame in frames if frame in self.unusable)
-        reasons += self._other_names(base_frame, frames) + self._others.advice()
+        # frames may have the same reason
+        wrong = dict.fromkeys(self.unusable[frame] for frame in frames if frame in self.unusable)
+        reasons = ''.join(f' {why}' for why in wrong) or self._other_names(base_frame, frames)
+        reasons += self._others.advice()
         options = ' '.join(f'--sensor {quoted(f"{frame}=x,y,yaw")}' for frame in frames[:MOST_OPTIONS])
         more = ', and so on' if len(frames) > MOST_OPTIONS else ''
         return (

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from functools import partial
+from functools import cache, partial
 from pathlib import Path
 
 from ..bags.choice import Topics
@@ -87,12 +87,13 @@ def read_drive(
         else:
             topics = bag.choose_range_topics(range_topics)
         constant = partial(_constant_transforms, path, topics)
-        joints = partial(_moving_transforms, path, topics)
+        times = parameters.association
+        parents = cache(partial(_parents, path))
+        joints = partial(_moving_transforms, path, topics, parents, max(times.pose_timeout, times.max_pose_gap))
         lookup = Extrinsics(extrinsics, bag.static_transforms(topics), constant, OtherBags(others, topics), joints)
         associator = BatchAssociator(lookup, parameters, lookup.moves)
         live = FullLiveMap(associator, parameters)
         # a reading is placed by the poses before and after it
-        times = parameters.association
         margin = (times.max_pose_gap + abs(times.range_time_offset)) * NANOSECONDS
         spans = Spans(part, margin)
         for batch in bag.batches(topics, progress):
@@ -152,10 +153,23 @@ def _constant_transforms(path: Path | str, topics: Topics) -> StaticTransforms:
         return bag.constant_transforms_on_tf(topics)
 
 
-def _moving_transforms(path: Path | str, topics: Topics, base_frame: str, frame: str) -> MovingTransforms:
+def _parents(path: Path | str) -> dict[str, str]:
+    """Return the parents of the frames on `/tf`, in the same way."""
+    with Bag(path) as bag:
+        return bag.moving_frames()
+
+
+def _moving_transforms(
+    path: Path | str,
+    topics: Topics,
+    parents: Callable[[], Mapping[str, str]],
+    longest_gap: float,
+    base_frame: str,
+    frame: str,
+) -> MovingTransforms:
     """Return the transforms between a sensor and the robot, in the same way."""
     with Bag(path) as bag:
-        return bag.moving_transforms(topics, base_frame, frame)
+        return bag.moving_transforms(topics, parents(), base_frame, frame, longest_gap)
 
 
 def _choosing(topics: Sequence[str]) -> str:

@@ -15,7 +15,7 @@ from forward_grid_mapper.bags.writer import BagWriter
 from forward_grid_mapper.core.common.errors import BagError, InputError
 from forward_grid_mapper.core.common.parameters import Parameters
 from forward_grid_mapper.core.messages.message_types import OdometryMessage, Pose2, RangeMessage
-from forward_grid_mapper.recordings.drive import Drive
+from forward_grid_mapper.recordings.drive import Drive, Part
 from forward_grid_mapper.recordings.read_drive import read_drive
 
 SECOND = 1_000_000_000
@@ -159,6 +159,68 @@ def test_readings_outside_the_time_of_a_joint_are_rejected(tmp_path: Path) -> No
         assert math.remainder(readings.yaw[k] - expected.yaw, math.tau) == pytest.approx(0.0, abs=1e-9)
 
 
+def test_given_pose_takes_precedence_over_a_joint(tmp_path: Path) -> None:
+    servo = ('base_link', 'servo', lambda i: Pose2(0.1, 0.0, i / 10))
+    path = recorded(tmp_path / 'bag', [[('odom', 'base_link', at), servo]], fixed=('servo', 'sonar'))
+    given = Pose2(0.3, 0.0, 1.0)
+    drive = read_drive(path, Parameters(), {'sonar': given}, None, 'tf')
+    assert drive.source['mounts_from'] == 'parameters' and drive.source['extrinsics'] == {'sonar': given}
+    assert drive.associator.readings.yaw[30] == pytest.approx(at(30 + 1e-5).yaw + 1.0, abs=1e-6)
+
+
+@pytest.mark.parametrize('offset', [-2.0, 2.0])
+def test_part_of_a_drive_has_the_odometry_for_its_shifted_stamps(tmp_path: Path, offset: float) -> None:
+    with BagWriter(tmp_path / 'bag') as writer:
+        for i in range(100):
+            stamp = (i + 1) * SECOND // 10
+            writer.write_odometry('/odom', OdometryMessage(stamp, 'odom', 'base_link', at(i)))
+            writer.write_range('/sonar', RangeMessage(stamp, 'sonar', 1.0 + i / 64, 0.125, 5.0, 0.25))
+    parameters = Parameters.from_flat({'range_time_offset': offset, 'max_pose_gap': 0.2})
+    drive = read_drive(tmp_path / 'bag', parameters, {'sonar': SENSOR}, part=Part(4.0, 2.0))
+    assert len(drive.associator.readings) == 20 and not drive.associator.rejected
+
+
+def test_base_that_is_itself_on_the_frame_of_a_joint(tmp_path: Path) -> None:
+    """The robot's base may be a child of the frame that carries the servo, even a moving one."""
+
+    def lifted(i: float) -> Pose2:
+        return Pose2(0.2 - i / 200, 0.1, 0.3 + i / 100)
+
+    with TransformWriter(tmp_path / 'bag') as writer:
+        writer.write_static_transforms([('servo', 'sonar', SENSOR)], 0)
+        for i in range(60):
+            stamp = (i + 1) * SECOND // 10
+            writer.write_odometry('/odom', OdometryMessage(stamp, 'odom', 'base_footprint', at(i)))
+            servo = ('base_link', 'servo', Pose2(0.1, 0.0, i / 40))
+            writer.write_transforms([('base_link', 'base_footprint', lifted(i)), servo], stamp)
+            writer.write_range('/sonar', RangeMessage(stamp, 'sonar', 1.0 + i / 64, 0.125, 5.0, 0.25))
+    readings = read(tmp_path / 'bag', None).associator.readings
+    assert len(readings) == 60
+    for i in range(60):
+        base = lifted(i)
+        c, s = math.cos(base.yaw), math.sin(base.yaw)
+        inverse = Pose2(-c * base.x - s * base.y, s * base.x - c * base.y, -base.yaw)
+        expected = at(i).compose(inverse).compose(Pose2(0.1, 0.0, i / 40)).compose(SENSOR)
+        assert (readings.x[i], readings.y[i]) == pytest.approx(expected[:2])
+        assert math.remainder(readings.yaw[i] - expected.yaw, math.tau) == pytest.approx(0.0, abs=1e-9)
+
+
+def test_readings_in_a_gap_of_a_joint_are_rejected(tmp_path: Path) -> None:
+    with TransformWriter(tmp_path / 'bag') as writer:
+        for i in range(100):
+            stamp = (i + 1) * SECOND // 10
+            writer.write_odometry('/odom', OdometryMessage(stamp, 'odom', 'base_link', at(i)))
+            # the gaps are 2 s and 2.1 s
+            if i in (0, 20) or i >= 41:
+                writer.write_transforms([('base_link', 'sonar', Pose2(0.1, 0.0, i / 40))], stamp)
+            writer.write_range('/sonar', RangeMessage(stamp, 'sonar', 1.0 + i / 64, 0.125, 5.0, 0.25))
+    drive = read(tmp_path / 'bag', None)
+    assert drive.associator.rejected == {'late_transform': 20}
+    # the node waits as long
+    patient = read_drive(tmp_path / 'bag', Parameters.from_flat({'pose_timeout': 2.1}), {})
+    assert not patient.associator.rejected
+
+
 def test_sensor_whose_joint_is_not_joined_to_the_robot_is_named(tmp_path: Path) -> None:
     servo = ('arm', 'servo', lambda i: Pose2(0.1, 0.0, i / 10))
     path = recorded(tmp_path / 'bag', [[('odom', 'base_link', at)], [servo]], fixed=('servo', 'sonar'))
@@ -168,12 +230,48 @@ def test_sensor_whose_joint_is_not_joined_to_the_robot_is_named(tmp_path: Path) 
         read(path)
 
 
+def test_transforms_are_searched_once_for_all_sensors_without_a_pose(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with TransformWriter(tmp_path / 'bag') as writer:
+        for i in range(50):
+            stamp = (i + 1) * SECOND // 10
+            writer.write_transforms([('odom', 'base_link', at(i)), ('arm', 'servo', at(i))], stamp)
+            for k in range(8):
+                writer.write_range(f'/sonar{k}', RangeMessage(stamp, f'sonar{k}', 1.0, 0.125, 5.0, 0.25))
+    decoded = []
+    original = Bag._decoded
+
+    def counting(self: Bag, *args: Any) -> Any:
+        for channel, message in original(self, *args):
+            decoded.append(channel.topic)
+            yield channel, message
+
+    monkeypatch.setattr(Bag, '_decoded', counting)
+    with pytest.raises(InputError, match='is known for sonar0, sonar1, sonar2'):
+        read(tmp_path / 'bag', '/tf')
+    # for the chain of the robot's pose, the constant transforms and the parents
+    assert decoded.count('/tf') == 3 * 50
+
+
 def test_frame_with_two_parents_is_no_joint(tmp_path: Path) -> None:
     servo = ('base_link', 'servo', lambda i: Pose2(0.1, 0.0, i / 10))
-    other = ('odom', 'servo', lambda i: Pose2(0.1, 0.0, i / 10))
-    path = recorded(tmp_path / 'bag', [[('odom', 'base_link', at)], [servo], [other]], fixed=('servo', 'sonar'))
-    with pytest.raises(InputError, match='no pose on the robot'):
-        read(path)
+    for name in ('odom', 'mast'):
+        other = (name, 'servo', lambda i: Pose2(0.1, 0.0, i / 10))
+        path = recorded(tmp_path / name, [[('odom', 'base_link', at)], [servo], [other]], fixed=('servo', 'sonar'))
+        named = f'/tf has servo in two frames, base_link and {name}: a frame has one parent'
+        with pytest.raises(InputError, match=f'no pose on the robot.* {named}'):
+            read(path)
+
+
+def test_robot_with_two_parents_has_no_joint(tmp_path: Path) -> None:
+    links = [[('odom', 'base_link', at)], [('base_footprint', 'base_link', at)], [('odom', 'base_footprint', at)]]
+    servo = ('odom', 'servo', lambda i: Pose2(0.1, 0.0, i / 10))
+    path = recorded(tmp_path / 'bag', [*links, [servo]], fixed=('servo', 'sonar'))
+    with Bag(path) as bag:
+        topics = bag.choose_topics(None, 'tf', any_poses=True)
+        moving = bag.moving_transforms(topics, bag.moving_frames(), 'base_link', 'sonar', 2.0)
+    assert not moving.connects('base_link', 'sonar')
 
 
 @pytest.mark.parametrize('kind', ['mcap', 'ros1'])

@@ -304,8 +304,9 @@ class PoseAssociator(MessageAccount):
     def _time_out(self, newest: int | None, left: int) -> int:
         """Reject readings that waited too long, and look up poses again; at most `left`; return what remains of it."""
         now = max(self._newest_range or 0, newest or 0)
-        # a gap that would be bridged must not time out first
-        patience = max(self.parameters.pose_timeout, self.parameters.max_pose_gap)
+        # a gap that would be bridged must not time out first, nor a reading that is placed later than it is stamped
+        times = self.parameters
+        patience = max(times.pose_timeout, times.max_pose_gap) + max(times.range_time_offset, 0.0)
         limit = now - round(patience * NANOSECONDS)
         if newest is not None and self._waiting and newest >= self._next_look:
             self._next_look = newest + NANOSECONDS

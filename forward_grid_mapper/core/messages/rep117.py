@@ -42,7 +42,8 @@ REASONS = {
     'unprintable_frame_id': 'the frame_id has characters that cannot be printed',
     'unknown_extrinsics': 'the pose of this frame on the robot is unknown: set sensors.<frame_id>.pose in a parameter '
     'file, or publish its transform',
-    'late_transform': 'TF knows this frame, but no transform for the stamp arrived within pose_timeout',
+    'late_transform': 'TF knows this frame, but no transform for the stamp arrived within pose_timeout; in a bag, none '
+    'before or after it, or they are farther apart than that',
     'steep_sensor': 'the sensor points up or down by more than 60°, or its cone contains the vertical',
     'before_odometry': 'the stamp is before the first odometry, or minutes before the newest; if this continues, the '
     'clocks of the drivers differ',

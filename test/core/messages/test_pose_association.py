@@ -138,6 +138,17 @@ def test_reading_with_a_time_offset_waits_for_odometry() -> None:
     assert p.waiting == 0 and len(p.readings) == 1
 
 
+def test_time_offset_is_not_part_of_the_timeout() -> None:
+    clock = Clock()
+    p = associator(clock=clock, range_time_offset=2.0)
+    for i in range(200):
+        clock.now = i / 10
+        p.add_range(sonar(10.0 + clock.now))
+        # odometry arrives late
+        p.add_odometry(odometry(9.7 + clock.now, clock.now))
+    assert not p.rejected and p.waiting + len(p.readings) == 200 and p.waiting < 30
+
+
 def test_readings_without_pose_are_rejected_with_reason() -> None:
     clock = Clock()
     p = associator(clock=clock, max_pose_gap=0.5, pose_timeout=1.0)
