@@ -14,6 +14,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -97,6 +98,11 @@ class Estimate(NamedTuple):
     readings: int
     best: TrialMap
 
+    def of(self, best: TrialMap, given: TrialMap) -> Estimate:
+        """Return the estimate with the gain of other maps, at its value and at zero."""
+        gain, sigmas = best.objective - given.objective, _sigmas(best.blocks - given.blocks)
+        return self._replace(best=best, gain=gain, sigmas=sigmas)
+
     @property
     def significant(self) -> bool:
         """Whether zero is wrong."""
@@ -117,7 +123,15 @@ def estimates(drive: MountedReadings, suspects: dict[Quantity, float], parameter
     p = coarse(parameters, part.readings)
     given = trial_map(part.readings, p)
     found = [_estimate(part, quantity, guess, given, p) for quantity, guess in suspects.items()]
-    return sorted((each for each in found if each and each.significant), key=lambda each: -each.gain)
+    wrong = [each for each in found if each and each.significant]
+    if wrong:
+        # a wall on the border of two cells gains as much if the cells are moved, which tells nothing about sensors
+        best = _on_best_cells(part.readings, given, p)
+        wrong = [
+            each.of(_on_best_cells(each.quantity.corrected(part, each.value), each.best, p), best) for each in wrong
+        ]
+        wrong = [each for each in wrong if each.significant]
+    return sorted(wrong, key=lambda each: -each.gain)
 
 
 def as_good(best: Estimate, other: Estimate) -> bool:
@@ -161,6 +175,13 @@ def _estimate(
         len(part),
         found,
     )
+
+
+def _on_best_cells(readings: Readings, known: TrialMap, parameters: Parameters) -> TrialMap:
+    """Return the best map of the same readings: a known one, or one on cells that are moved by half of a cell."""
+    half = parameters.grid.resolution / 2
+    moved = (replace(readings, x=readings.x - x, y=readings.y - y) for x, y in ((half, 0.0), (0.0, half), (half, half)))
+    return max((known, *(trial_map(each, parameters) for each in moved)), key=lambda each: each.objective)
 
 
 def _sigmas(gains: Floats) -> float:
