@@ -16,6 +16,7 @@ from sensor_msgs.msg import Range
 from ..core.common.parameters import Parameters
 from ..core.messages.message_types import OdometryMessage, RangeMessage, odometry_message, range_message, stamp_of
 from ..core.messages.pose_association import MOST_WAITING, PoseAssociator
+from ..core.messages.rep117 import corrected
 from ..core.messages.repeated_topics import RepeatedTopics
 from .clocks import OdometryClock, SensorClocks
 from .frames import MapFrame
@@ -309,7 +310,8 @@ class Intake:
         elif paused:
             self._associator.reject(message, 'paused')
         else:
-            self._sensor_clocks.note(message.frame_id, message.stamp, self._newest_odometry())
+            stamp = corrected(message.stamp, self._associator.parameters)
+            self._sensor_clocks.note(message.frame_id, stamp, self._newest_odometry())
             self._associator.add_range(message, sent)
 
     def _newest_odometry(self) -> int | None:

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation, Slerp
 
@@ -28,6 +28,7 @@ def message(stamp: int, parent: str, child: str, offset: Any, turn: Any) -> Any:
     return Made(transforms=[item])
 
 
+@settings(deadline=None)
 @given(
     turns=st.tuples(*2 * [st.tuples(numbers, numbers, numbers)]),
     offsets=st.tuples(*2 * [st.tuples(numbers, numbers, numbers)]),

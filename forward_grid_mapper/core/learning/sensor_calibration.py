@@ -98,8 +98,8 @@ class Estimate(NamedTuple):
     readings: int
     best: TrialMap
 
-    def of(self, best: TrialMap, given: TrialMap) -> Estimate:
-        """Return the estimate with the gain of other maps, at its value and at zero."""
+    def gained_by(self, best: TrialMap, given: TrialMap) -> Estimate:
+        """Return the estimate with the gain of one map, made with its value, over another, made without."""
         gain, sigmas = best.objective - given.objective, _sigmas(best.blocks - given.blocks)
         return self._replace(best=best, gain=gain, sigmas=sigmas)
 
@@ -128,7 +128,8 @@ def estimates(drive: MountedReadings, suspects: dict[Quantity, float], parameter
         # a wall on the border of two cells gains as much if the cells are moved, which tells nothing about sensors
         best = _on_best_cells(part.readings, given, p)
         wrong = [
-            each.of(_on_best_cells(each.quantity.corrected(part, each.value), each.best, p), best) for each in wrong
+            each.gained_by(_on_best_cells(each.quantity.corrected(part, each.value), each.best, p), best)
+            for each in wrong
         ]
         wrong = [each for each in wrong if each.significant]
     return sorted(wrong, key=lambda each: -each.gain)

@@ -24,7 +24,7 @@ from .message_batch import Ints, MessageBatch, Odometry
 from .message_types import Pose2, RangeMessage
 from .pose_association import PoseAssociator
 from .pose_history import Poses
-from .rep117 import LONGEST_NAME, Measurement, Measurements, measure_all, measured_at
+from .rep117 import LONGEST_NAME, Measurement, Measurements, all_corrected, measure_all
 from .stamp_order import JUMP
 
 NEVER = np.iinfo(np.int64).max
@@ -108,7 +108,7 @@ class BatchAssociator(PoseAssociator):
         frames = list(ranges.frames)
         good = measured.reason == ''
         numbers = self.received + 1 + np.arange(len(good))
-        stamp = measured_at(ranges, self.parameters)
+        stamp = all_corrected(ranges, self.parameters)
         new = _Waiting(ranges.place, numbers, stamp, ranges.frame, *measured[1:]).select(good)
         self.received += len(good)
         if len(new.stamp):

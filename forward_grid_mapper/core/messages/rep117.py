@@ -175,10 +175,13 @@ def measure(message: RangeMessage, parameters: AssociationParameters) -> Measure
             return 'over_range'
         z = z_max
     measurement = Measurement(message, z, z_max, angle / 2, sigma)
-    # a stamp of zero is none
-    if message.stamp:
-        measurement.stamp += _offset(parameters)
+    measurement.stamp = corrected(message.stamp, parameters)
     return measurement
+
+
+def corrected(stamp: int, parameters: AssociationParameters) -> int:
+    """Return the stamp of a Range message with `range_time_offset` added, nanoseconds; zero is no stamp, and stays."""
+    return stamp and stamp + _offset(parameters)
 
 
 def _offset(parameters: AssociationParameters) -> int:
@@ -312,8 +315,8 @@ def measure_all(messages: Ranges, parameters: AssociationParameters) -> Measurem
     return Measurements(reason, np.where(over, z_max, z), z_max, angle / 2, sigma)
 
 
-def measured_at(messages: Ranges, parameters: AssociationParameters) -> NDArray[np.int64]:
-    """Return the stamps of many messages with `range_time_offset` added, nanoseconds, shape (N,)."""
+def all_corrected(messages: Ranges, parameters: AssociationParameters) -> NDArray[np.int64]:
+    """Apply `corrected` to many messages; return shape (N,)."""
     return np.where(messages.stamp == 0, 0, messages.stamp + _offset(parameters))
 
 
