@@ -146,7 +146,7 @@ def test_part_driven_during_a_run_is_followed_at_its_end(
     assert robot.node.trajectory.following.follower is before, 'the one before goes on meanwhile'
     held.go_on.set()
     robot.until(lambda: answer.sent)
-    assert answer.sent[0][0]
+    assert answer.sent[0][0], answer.sent
     after = robot.node.trajectory.following.follower
     assert after is not before
     assert after.windows >= 10, 'it is where the robot is as soon as it is in force'

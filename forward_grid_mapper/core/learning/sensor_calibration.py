@@ -126,13 +126,11 @@ def estimates(drive: MountedReadings, suspects: dict[Quantity, float], parameter
     wrong = [each for each in found if each and each.significant]
     if wrong:
         # a wall on the border of two cells gains as much if the cells are moved, which tells nothing about sensors
-        best = _on_best_cells(part.readings, given, p)
-        wrong = [
-            each.gained_by(_on_best_cells(each.quantity.corrected(part, each.value), each.best, p), best)
-            for each in wrong
-        ]
-        wrong = [each for each in wrong if each.significant]
-    return sorted(wrong, key=lambda each: -each.gain)
+        without = _on_best_cells(part.readings, given, p)
+        for k, each in enumerate(wrong):
+            with_value = _on_best_cells(each.quantity.corrected(part, each.value), each.best, p)
+            wrong[k] = each.gained_by(with_value, without)
+    return sorted((each for each in wrong if each.significant), key=lambda each: -each.gain)
 
 
 def as_good(best: Estimate, other: Estimate) -> bool:
