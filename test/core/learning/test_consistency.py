@@ -192,6 +192,13 @@ def test_wrong_poses_give_one_warning_with_the_cause(name: str) -> None:
     assert re.search(expected, warnings[0]), warnings
 
 
+def test_remedy_includes_the_offset_that_is_set() -> None:
+    late = office().late(0.15)
+    readings = associated(*late).readings
+    (warning,) = consistency_warnings(readings, late.extrinsics, Parameters.from_flat({'range_time_offset': -0.1}))
+    assert re.search(r'0\.1[3-7] s .* too late.*range_time_offset to -0\.2[3-7],', warning), warning
+
+
 def in_a_room(turns: Callable[[float], float]) -> Messages:
     """A robot in a room of 8 by 6 metres that alternately turns by 0.5 rad/s and drives; `turns` changes its yaw.
 
