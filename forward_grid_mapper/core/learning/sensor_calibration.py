@@ -45,7 +45,7 @@ class Quantity(NamedTuple):
     Attributes
     ----------
     guesses : tuple of float
-        Values that are tried first; J has no other maximum between them.
+        Values that are tried first; the search climbs from the best one.
     step : float
         Distance between the values at which J is evaluated near its maximum.
     corrected : callable
