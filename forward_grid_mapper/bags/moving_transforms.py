@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from bisect import bisect_left
-from collections.abc import Collection
+from collections.abc import Collection, Mapping
 from typing import Any
 
 import numpy as np
@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from ..core.messages.extrinsics import LATE, Mount, mount_of
 from ..core.messages.message_types import NANOSECONDS, stamp_of
 from ..core.messages.quaternions import rotation_of
-from .static_transforms import StaticTransforms, Transform, plain
+from .static_transforms import StaticTransforms, Transform, plain, way_up
 from .transform_chain import Numbers, numbers_of
 
 NEARLY_EQUAL = 0.9995
@@ -66,6 +66,35 @@ class MovingTransforms:
         self._longest = longest_gap * NANOSECONDS
         self._joints: dict[str, _Joint] = {}
         self._several: dict[str, str] = {}
+        self._ways: dict[tuple[str, str], tuple[list[str], list[str]] | None] = {}
+
+    @classmethod
+    def between(
+        cls,
+        fixed: StaticTransforms,
+        parents: Mapping[str, str],
+        base_frame: str,
+        sensor_frame: str,
+        longest_gap: float,
+    ) -> MovingTransforms:
+        """Prepare for the frames that may connect a sensor to the robot.
+
+        `parents` are the parents of all frames that moving transforms place; no frames are kept if they do not help.
+        """
+
+        def parent(frame: str) -> str | None:
+            step = fixed.step(frame)
+            return parents.get(frame) if step is None else step[0]
+
+        to_sensor, to_base = (set(way_up(frame, parent)) for frame in (sensor_frame, base_frame))
+        helps = not to_sensor.isdisjoint((*to_base, *parents))
+        # what is above both does not matter
+        return cls(fixed, to_sensor.symmetric_difference(to_base) if helps else (), longest_gap)
+
+    @property
+    def empty(self) -> bool:
+        """Whether no frames are kept."""
+        return not self._frames
 
     def add_message(self, message: Any) -> None:
         """Add the transforms of a `tf2_msgs/TFMessage`; invalid ones are left out."""
@@ -73,6 +102,7 @@ class MovingTransforms:
             parent, child = plain(str(item.header.frame_id)), plain(str(item.child_frame_id))
             if child not in self._frames or parent == child:
                 continue
+            self._ways.clear()
             joint = self._joints.setdefault(child, _Joint(parent, self._longest))
             numbers = numbers_of(item.transform)
             if joint.parent != parent:
@@ -82,16 +112,12 @@ class MovingTransforms:
 
     def connects(self, base_frame: str, sensor_frame: str) -> bool:
         """Return whether there is a way from the robot to a sensor, in which no frame has several parents."""
-        up, to_sensor = set(self._way(plain(base_frame))), self._way(plain(sensor_frame))
-        common = next((frame for frame in to_sensor if frame in up), None)
-        if common is None:
-            return False
-        way = [each for frame in (base_frame, sensor_frame) for each in self._below(plain(frame), common)]
-        return self._several.keys().isdisjoint(way)
+        ways = self._apart(base_frame, sensor_frame)
+        return ways is not None and self._several.keys().isdisjoint((*ways[0], *ways[1]))
 
     def doubt(self, base_frame: str, sensor_frame: str) -> str:
         """Return which frame above the robot or a sensor has several parents, in words; '' if none has."""
-        above = [*self._way(plain(sensor_frame)), *self._way(plain(base_frame))]
+        above = [*way_up(sensor_frame, self._parent), *way_up(base_frame, self._parent)]
         frame = next((each for each in above if each in self._several), None)
         if frame is None:
             return ''
@@ -108,12 +134,10 @@ class MovingTransforms:
         Mount, str or None
             The reason why there is none at this stamp; None if the frames are not connected.
         """
-        base_frame, sensor_frame = plain(base_frame), plain(sensor_frame)
-        up = set(self._way(base_frame))
-        common = next((frame for frame in self._way(sensor_frame) if frame in up), None)
-        if common is None:
+        ways = self._apart(base_frame, sensor_frame)
+        if ways is None:
             return None
-        to_base, to_sensor = (self._pose_in(common, frame, stamp) for frame in (base_frame, sensor_frame))
+        to_base, to_sensor = (self._pose_along(way, stamp) for way in ways)
         if to_base is None or to_sensor is None:
             return LATE.reason
         pose = np.linalg.inv(to_base) @ to_sensor
@@ -124,25 +148,23 @@ class MovingTransforms:
             return step[0]
         return self._joints[frame].parent if frame in self._joints else None
 
-    def _way(self, frame: str) -> list[str]:
-        """Return the frame and its ancestors, nearest first."""
-        found: list[str] = []
-        at: str | None = frame
-        while at is not None and at not in found:
-            found.append(at)
-            at = self._parent(at)
-        return found
+    def _apart(self, base_frame: str, sensor_frame: str) -> tuple[list[str], list[str]] | None:
+        """Return the ways up from the robot and from a sensor to where they meet; None if they do not."""
+        key = base_frame, sensor_frame
+        if key not in self._ways:
+            to_base, to_sensor = (way_up(frame, self._parent) for frame in key)
+            common = next((frame for frame in to_sensor if frame in to_base), None)
+            self._ways[key] = None
+            if common is not None:
+                self._ways[key] = to_base[: to_base.index(common)], to_sensor[: to_sensor.index(common)]
+        return self._ways[key]
 
-    def _below(self, frame: str, common: str) -> list[str]:
-        way = self._way(frame)
-        return way[: way.index(common)]
-
-    def _pose_in(self, common: str, frame: str, stamp: int) -> NDArray[np.float64] | None:
-        """Return the pose of a frame in one of its ancestors; None if a joint has none at this stamp."""
+    def _pose_along(self, way: list[str], stamp: int) -> NDArray[np.float64] | None:
+        """Return the pose of the first frame in the parent of the last; None if a joint has none at this stamp."""
         whole = np.eye(4)
-        for each in self._below(frame, common):
-            step = self._fixed.step(each)
-            transform = self._joints[each].at(stamp) if step is None else step[1]
+        for frame in way:
+            step = self._fixed.step(frame)
+            transform = self._joints[frame].at(stamp) if step is None else step[1]
             if transform is None:
                 return None
             whole = transform @ whole

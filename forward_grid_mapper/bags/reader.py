@@ -27,7 +27,7 @@ from .opening import open_sources
 from .poses import POSES
 from .repair import Problem, reasons_of, remedies_of, repair_hint
 from .source import Channel, RawMessage, Source, close_all, one_line
-from .static_transforms import StaticTransforms, plain
+from .static_transforms import StaticTransforms
 from .transform_chain import TransformChain, chain_of, constant_transforms
 
 _CONVERSIONS: dict[str, Callable[[Any], RangeMessage | OdometryMessage | None]] = {RANGE: range_message, **POSES}
@@ -281,20 +281,10 @@ class Bag:
         `parents` are those of `moving_frames`, and `longest_gap` is that of `MovingTransforms`, seconds.
         """
         fixed = self.static_transforms(topics)
-        ways = []
-        for frame in (sensor_frame, base_frame):
-            way: list[str] = []
-            at: str | None = plain(frame)
-            while at is not None and at not in way:
-                way.append(at)
-                step = fixed.step(at)
-                at = parents.get(at) if step is None else step[0]
-            ways.append(way)
-        # what is above both does not matter
-        joined = not set(ways[0]).isdisjoint((*ways[1], *parents))
-        moving = MovingTransforms(fixed, set(ways[0]).symmetric_difference(ways[1]), longest_gap)
+        moving = MovingTransforms.between(fixed, parents, base_frame, sensor_frame, longest_gap)
         # it takes long to read all transforms of a long drive
-        for channel, message in self._decoded({(topic, TF_MESSAGE) for topic in self.moving_topics() if joined}):
+        sources = set[str]() if moving.empty else self.moving_topics()
+        for channel, message in self._decoded({(topic, TF_MESSAGE) for topic in sources}):
             if message is None:
                 continue
             try:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from itertools import takewhile
 from typing import Any
 
@@ -184,6 +184,16 @@ class StaticTransforms:
 def _same(one: tuple[str, Transform], other: tuple[str, Transform]) -> bool:
     """Return whether two transforms of a frame, each with its parent, are equal."""
     return one[0] == other[0] and np.allclose(one[1], other[1], atol=SAME)
+
+
+def way_up(frame: str, parent_of: Callable[[str], str | None]) -> list[str]:
+    """Return a frame and its ancestors, nearest first; a loop of frames, which tf2 cannot resolve either, ends it."""
+    found: list[str] = []
+    at: str | None = plain(frame)
+    while at is not None and at not in found:
+        found.append(at)
+        at = parent_of(at)
+    return found
 
 
 def plain(frame: str) -> str:
