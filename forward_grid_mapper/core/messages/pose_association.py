@@ -203,7 +203,10 @@ class PoseAssociator(MessageAccount):
             return
         if not self.map_frame and not self.base_frame:
             self.map_frame, self.base_frame = message.frame_id, message.child_frame_id
-        if (message.frame_id, message.child_frame_id) != (self.map_frame, self.base_frame):
+        if (message.frame_id.lstrip('/'), message.child_frame_id.lstrip('/')) != (
+            self.map_frame.lstrip('/'),
+            self.base_frame.lstrip('/'),
+        ):
             self.odometry_rejected['other_frame'] += 1
             self._other_frame = True
             return

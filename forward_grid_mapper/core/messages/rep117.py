@@ -60,7 +60,8 @@ REASONS = {
     'time_jump': 'the clock jumped back while the reading waited for its pose',
     'too_many_waiting': 'too many readings waited for odometry at once',
     'too_far_away': 'the map would have more than max_cells cells; are pose and max_range right?',
-    'far_from_map': 'the reading is farther than max_jump from the mapped area; if the pose is right, call reset',
+    'far_from_map': 'the reading is farther than max_jump from the mapped area; if the pose is right, begin a new map (in '
+    'the node: call reset)',
     'large_cone': 'the cone has millions of cells; are range, field of view and resolution right?',
     'paused': 'the mapper was paused',
 }
@@ -110,8 +111,8 @@ ODOMETRY_REASONS = {
     'unprintable_frame_id': 'the frame_id or child_frame_id has characters that cannot be printed',
     'ahead_of_others': 'the stamp is more than a second ahead of those before and after it: do two nodes publish '
     'odometry, or was a clock set?',
-    'other_frame': 'the frame_id or child_frame_id is not that of the first odometry message; call reset to use the '
-    'new one',
+    'other_frame': 'the frame_id or child_frame_id is not that of the first odometry message; in the node, call reset '
+    'to use the new one',
 }
 """Why an odometry message is rejected, in words."""
 

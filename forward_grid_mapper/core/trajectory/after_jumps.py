@@ -290,7 +290,7 @@ OUTCOME_WORDS = {
     DRIVEN: ', and the readings after it fit the poses of odometry',
     UNKNOWN: (
         ', and the readings after it do not determine the pose of the robot: they are mapped with the poses of '
-        'odometry, which may be wrong; after a jump call reset, or map the rest of the drive separately'
+        'odometry, which may be wrong; map the rest of the drive separately (in the node: call reset after a jump)'
     ),
 }
 """The result for a jump in words, by `Begin.how`."""

@@ -253,6 +253,15 @@ def test_bad_odometry_is_rejected_with_reason() -> None:
     assert p.odometry_rejected == {'bad_pose': 1, 'other_frame': 1}
 
 
+def test_slash_before_a_frame_does_not_change_the_frame() -> None:
+    p = associator()
+    p.add_odometry(odometry(0.0))
+    first = odometry(0.2)
+    p.add_odometry(first._replace(frame_id=f'/{first.frame_id}', child_frame_id=f'/{first.child_frame_id}'))
+    p.add_range(sonar(0.1))
+    assert not p.odometry_rejected and len(p.buffer) == 1
+
+
 def test_pose_at_a_million_metres_is_rejected() -> None:
     p = associator()
     for second, x in ((0.0, 0.0), (0.1, 1e6), (0.2, 1e9), (0.3, 0.0)):
