@@ -70,7 +70,8 @@ def driving(
     def begin(**options: Any) -> Inside:
         robot = inside(**{'refine_poses': True, 'online': True, **mounts, **options}).start()
         robot.hand(drifting.parts[0])
-        assert robot.call(robot.node.em.run_em)[0]
+        success, message = robot.call(robot.node.em.run_em)
+        assert success, message
         return robot
 
     return begin
