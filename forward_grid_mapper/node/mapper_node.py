@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import gc
 from collections.abc import Callable
-from contextlib import ExitStack
 from functools import partial
 from typing import Any
 
@@ -214,28 +213,25 @@ class MapperNode(ManagedNode):
         self.get_logger().info('inactive: nothing is received; maps and services stay')
 
     def close(self) -> None:
-        """End the work in the background, also of a configuration that failed."""
+        """End the work in the background, also of a configuration that failed; failures are logged."""
         self._started = self.mapping = False
         calls, ends = self._calls, self._ends
         self._calls, self._ends = [], []
         self._when_ready.clear()
-        with ExitStack() as work:
-            # calls that wait will get no result
-            for service in calls:
-                work.callback(service.end, 'the node is being cleaned up')
-            # the last one first; compilation is finished in any case, for the next configuration
-            for end in ends:
-                work.callback(end)
+        # the last one first; compilation is finished in any case, for the next configuration
+        for end in reversed(ends):
+            self._attempt(end)
+        # calls that wait will get no result
+        for service in calls:
+            self._attempt(partial(service.end, 'the node is being cleaned up'))
 
     def _undo(self) -> None:
-        try:
-            super()._undo()
-        finally:
-            # `Kernels` froze the existing objects, and the collector ignores frozen ones
-            for name in vars(self).keys() - self._own - {'_own'}:
-                delattr(self, name)
-            gc.unfreeze()
-            gc.collect()
+        super()._undo()
+        for name in vars(self).keys() - self._own - {'_own'}:
+            delattr(self, name)
+        # `Kernels` froze the existing objects, and the collector ignores frozen ones
+        gc.unfreeze()
+        gc.collect()
 
     # the start
 
