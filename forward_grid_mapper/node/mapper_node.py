@@ -21,6 +21,7 @@ from ..core.messages.message_types import NANOSECONDS
 from ..core.messages.pose_association import PoseAssociator
 from ..core.messages.rep117 import rejection_warnings, sensor_rejections
 from ..files.output_folder import unwritable
+from ..files.parameter_file import NODE_NAME
 from . import ros_parameters
 from .background import Inbox, Worker
 from .complaints import of_ros
@@ -39,7 +40,6 @@ from .reporter import Reporter
 from .saver import Account, Saver
 from .trajectory import Trajectory
 
-NAME = 'forward_grid_mapper'
 FEED_PERIOD = 0.02
 """Seconds between two transfers of readings to the maps."""
 
@@ -69,7 +69,13 @@ class MapperNode(ManagedNode):
         ParameterError
             If a parameter given at start is not valid.
         """
-        super().__init__(NAME, automatically_declare_parameters_from_overrides=True, **options)
+        # undeclared ones for poses of further sensors; the validator refuses all others
+        super().__init__(
+            NODE_NAME,
+            automatically_declare_parameters_from_overrides=True,
+            allow_undeclared_parameters=True,
+            **options,
+        )
         self.parameters, _, warnings = ros_parameters.declare(self)
         for warning in warnings:
             self.get_logger().warning(warning)
@@ -287,7 +293,9 @@ class MapperNode(ManagedNode):
     # parameters
 
     def _validator(self) -> Callable[[Any], Any]:
-        return ros_parameters.validator(lambda: self.parameters, self._accept, lambda: self._started)
+        return ros_parameters.validator(
+            lambda: self.parameters, self._accept, lambda: self._started, self.has_parameter
+        )
 
     def _accept(self, parameters: Parameters) -> None:
         refine = self.parameters.node.refine_poses, parameters.node.refine_poses
