@@ -164,12 +164,18 @@ def check_apart(output: Path, work: Path) -> None:
     """
     results = Path(os.path.realpath(os.path.abspath(output)))  # noqa: PTH100 (as in `output_folder`)
     inner = work.resolve()
-    if inner == results or results in inner.parents or inner in results.parents:
-        where = 'is the folder of the results' if inner == results else 'and the folder of the results overlap'
-        raise ParameterError(
-            f'--work {readable(work)} {where} ({readable(results)}), but the work folder is deleted at the end: choose '
-            f'one outside the results, or leave out --work'
-        )
+    if inner == results:
+        where = 'is the folder of the results'
+    elif results in inner.parents:
+        where = f'is inside the folder of the results, {readable(results)}'
+    elif inner in results.parents:
+        where = f'contains the folder of the results, {readable(results)}'
+    else:
+        return
+    raise ParameterError(
+        f'--work {readable(work)} {where}, and the work folder is deleted at the end: choose one outside the results, or '
+        'leave out --work'
+    )
 
 
 def _check(options: argparse.Namespace) -> None:
