@@ -173,8 +173,8 @@ def check_apart(output: Path, work: Path) -> None:
     else:
         return
     raise ParameterError(
-        f'--work {readable(work)} {where}, and the work folder is deleted at the end: choose one outside the results, or '
-        'leave out --work'
+        f'--work {readable(work)} {where}, and the work folder is deleted at the end: choose one outside the results, '
+        'or leave out --work'
     )
 
 
