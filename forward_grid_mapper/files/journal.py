@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import itertools
 import json
+import os
 import sqlite3
 import threading
 import time
@@ -93,9 +94,12 @@ class Journal:
         Raises
         ------
         OutputError
-            If another process has locked it, or the folder cannot be made or written.
+            If another process has locked it, or the folder is a file, or cannot be made or written.
         """
         self.folder = expanded(folder).absolute()
+        if os.path.lexists(self.folder) and not self.folder.is_dir():
+            inside = f': give {self.folder.parent}' if DRIVE.fullmatch(self.folder.name) else ''
+            raise OutputError(f'{self.folder} is a file, but a journal is a folder{inside}')
         self._warn = warn
         self.trouble = self.notice = ''
         self.noticed = 0.0
