@@ -154,7 +154,9 @@ def test_part_driven_during_a_run_is_followed_at_its_end(
     assert drifting.off(robot) < 0.35
 
 
-def test_following_needs_online_and_refine_poses(driving: Callable[..., Inside], drifting: DriftingDrive) -> None:
+def test_following_needs_online_and_ends_with_a_run_without_refinement(
+    driving: Callable[..., Inside], drifting: DriftingDrive
+) -> None:
     robot = driving(online=False)
     base = robot.node.trajectory.correction
     assert robot.node.trajectory.following is None
@@ -162,12 +164,12 @@ def test_following_needs_online_and_refine_poses(driving: Callable[..., Inside],
     robot.spin(0.3)
     assert robot.node.trajectory.correction is base
     other = driving()
-    base = other.node.trajectory.correction
     other.set(refine_poses=False)
     other.hand(drifting.parts[1])
-    other.spin(0.3)
-    assert other.node.trajectory.correction is base
-    assert other.node.trajectory.following.follower.windows == 0
+    # the parameter takes effect with the next run
+    other.until(lambda: other.node.trajectory.following.follower.windows)
+    assert other.call(other.node.em.run_em)[0]
+    assert other.node.trajectory.correction is None and other.node.trajectory.following.follower is None
 
 
 def test_reset_ends_following(
