@@ -447,6 +447,20 @@ def test_following_begins_after_the_last_jump(exact: Recording, bent: tuple[Read
     assert follower._past.stamp.min() < odometry.stamp[jumps(odometry)[0]], 'what was driven before it is a place, too'
 
 
+def test_following_continues_if_messages_are_missing(exact: Recording, bent: tuple[Readings, Odometry]) -> None:
+    readings, odometry = without_messages(*bent, 10.0, 0.8)
+    true = odometry_of(exact).at(odometry.stamp)
+    known = int(np.searchsorted(odometry.travel, 0.6 * odometry.travel[-1]))
+    begun = Correction(
+        Odometry(odometry.stamp[:known], odometry.pose[:known]), Odometry(odometry.stamp[:known], true[:known])
+    )
+    follower = Follower(begun, {}, Parameters(), 0.03)
+    assert follower.follow(readings, odometry)
+    assert not follower.obstacle
+    corrected = follower.correction.extended(odometry.stamp, odometry.pose).pose
+    assert np.hypot(*(corrected - true)[known:, :2].T).max() < 0.35
+
+
 def test_following_needs_some_metres_after_a_jump(bent: tuple[Readings, Odometry]) -> None:
     readings, odometry = restarted(*bent, 0.9)
     follower = Follower(Correction(odometry, odometry), {}, Parameters())
