@@ -2,7 +2,9 @@
 
 Two kinds of doubtful steps are usually real motions, and are jumps only if readings show that the robot stood still. A
 turn that is too fast for a robot is usually that of a simulated robot; otherwise a gyroscope restarted. A step that is
-long, but no faster than this robot drives, usually comes from odometry with few messages.
+long, but no faster than this robot drives, usually comes from odometry with few messages, or from missing messages.
+If the robot moved before messages were missing and moves after that, such a step is not even doubtful: readings could
+not tell, since a corridor looks the same some metres further on.
 """
 
 from __future__ import annotations
@@ -32,7 +34,14 @@ STANDING = 0.01
 """Metres a second up to which the robot stands still: steps are then noise of a filter, and are ignored."""
 
 LONGEST_GAP, TIMES_GAP = 2.0, 4.0
-"""A driver was not restarted if the time between two poses is at most so many seconds, or so many times the median."""
+"""Messages are missing if the time between two poses is more than so many seconds, and so many times the median."""
+
+AT_ZERO = 0.01
+"""Metres, and radians: if odometry is so close to zero after missing messages, its driver was restarted."""
+
+MOMENT, MOVED = 1_000_000_000, 0.05
+"""The robot moves if it moves by so many metres, or radians, in so many nanoseconds before, or after, missing
+messages."""
 
 LONGEST_TURN, FASTEST_TURN = 0.5, 2 * math.pi
 """Radians between two poses, and radians a second: no robot turns by more than both."""
@@ -54,7 +63,10 @@ def jumps(odometry: Odometry) -> NDArray[np.int64]:
 
 
 def doubtful_steps(odometry: Odometry) -> NDArray[np.int64]:
-    """Return the indices of the poses after doubtful steps: turns that are too fast, or long steps at usual speed."""
+    """Return the indices of the poses after doubtful steps: turns that are too fast, or long steps at usual speed.
+
+    A long step is not doubtful if messages are missing, and the robot moved before and after that.
+    """
     found, doubtful = _found(odometry)
     return found[doubtful]
 
@@ -81,9 +93,23 @@ def _found(odometry: Odometry) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
         # with so few messages, a robot can drive more than the longest step between two
         fastest = FASTEST
     found = np.flatnonzero((far > longest) | _turned_too_fast(np.diff(pose[:, 2]), seconds))
-    gap = max(LONGEST_GAP, TIMES_GAP * apart)
-    driven = (far <= fastest * seconds) & (seconds <= gap)
+    missing = seconds > max(LONGEST_GAP, TIMES_GAP * apart)
+    at_zero = (np.hypot(pose[1:, 0], pose[1:, 1]) <= AT_ZERO) & (np.abs(wrapped(pose[1:, 2])) <= AT_ZERO)
+    driven = (far <= fastest * seconds) & ~(missing & at_zero)
+    sure = [k for k in found[(missing & driven)[found]].tolist() if _moved_around(odometry, k + 1)]
+    found = found[~np.isin(found, sure)]
     return found + 1, ((far <= longest) | driven)[found]
+
+
+def _moved_around(odometry: Odometry, at: int) -> bool:
+    """Return whether the robot moved just before the step to pose `at`, and just after it."""
+    stamp, pose = odometry.stamp, odometry.pose
+    first = min(int(np.searchsorted(stamp, stamp[at - 1] - MOMENT)), at - 2)
+    last = max(int(np.searchsorted(stamp, stamp[at] + MOMENT, side='right')) - 1, at + 1)
+    if first < 0 or last >= len(stamp):
+        return False
+    moved = pose[[at - 1, last]] - pose[[first, at]]
+    return bool(np.all(np.maximum(np.hypot(moved[:, 0], moved[:, 1]), np.abs(moved[:, 2])) >= MOVED))
 
 
 def _turned_too_fast(turn: Any, seconds: Any) -> Any:

@@ -207,7 +207,8 @@ def cut(readings: Readings, odometry: Odometry) -> Windows:
     # u does not grow while the robot stands; a node just after that gets a time within it, when readings were taken
     middle = np.interp(half, u[came], knots[came])
     again = np.concatenate([[False], np.diff(np.interp(middle, knots, u)) <= 0.0])
-    # unless the node before it is there already
+    # unless the node before it is there already, or lies in the same step, which may be many windows long
+    again[1:] |= np.diff(np.searchsorted(u[came], half, side='right')) == 0
     middle[again] = np.interp(half[again], u[came | went], knots[came | went])
     of_reading = np.clip(np.interp(seconds, knots, u).astype(np.int64), 0, count - 1)
     first = np.searchsorted(of_reading, np.arange(count + 1))

@@ -11,6 +11,9 @@ import pytest
 from forward_grid_mapper.core.common.errors import Cancelled
 from forward_grid_mapper.core.common.parameters import Parameters
 from forward_grid_mapper.core.common.readings import Readings
+from forward_grid_mapper.core.trajectory import registration
+from forward_grid_mapper.core.trajectory.likelihood import LANES, Scan
+from forward_grid_mapper.core.trajectory.local_map import LocalMap
 from forward_grid_mapper.core.trajectory.poses import compose, relative
 from forward_grid_mapper.core.trajectory.registration import (
     SILENT,
@@ -94,6 +97,29 @@ def test_registration_can_be_cancelled(two: tuple[Recording, Recording]) -> None
     one, other = two
     with pytest.raises(Cancelled):
         register(other.readings, other.robot[0], one.readings, Parameters(), np.ones(1, np.uint8))
+
+
+def test_search_ends_soon_after_it_was_cancelled(
+    two: tuple[Recording, Recording], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    one, other = two
+    stop, poses = np.zeros(1, np.uint8), []
+    around = OnMap(other.readings, other.robot[0], one.readings, Parameters(), stop)
+    values = registration.scores
+
+    def cancelled(scan: Scan, there: LocalMap, at: np.ndarray, stride: int = 1) -> np.ndarray:
+        poses.append(len(at))
+        stop[0] = len(poses) == 3
+        return values(scan, there, at, stride)
+
+    monkeypatch.setattr(registration, 'scores', cancelled)
+    with pytest.raises(Cancelled):
+        around.search(other.robot[0], np.array([0.25, 0.25, math.radians(10.0)]))
+    assert len(poses) == 3 and max(poses) <= LANES
+    with pytest.raises(Cancelled):
+        around.predicted(other.robot[0], 3)
+    with pytest.raises(Cancelled):
+        around.of_each(other.robot[0], 50)
 
 
 def test_poses_and_readings_are_moved_together() -> None:
