@@ -19,6 +19,7 @@ from ..core.messages.pose_association import MOST_WAITING, PoseAssociator
 from ..core.messages.rep117 import corrected
 from ..core.messages.repeated_topics import RepeatedTopics
 from .clocks import OdometryClock, SensorClocks
+from .draining import Draining
 from .frames import MapFrame
 from .heard import Heard
 from .losses import LASTING, Losses
@@ -131,12 +132,14 @@ class Intake:
 
     def _subscribe(self, kind: Any, topic: str, reliability: str, callback: Any, losses: Losses) -> None:
         quality = QoSProfile(depth=QUEUE, reliability=ReliabilityPolicy[reliability.upper()])
-        subscribe = partial(self._node.create_subscription, kind, topic, callback, quality)
+        draining = Draining(callback)
+        subscribe = partial(self._node.create_subscription, kind, topic, draining, quality)
         try:
             made = subscribe(event_callbacks=SubscriptionEventCallbacks(message_lost=losses.reported))
         except UnsupportedEventTypeError:
             # a middleware need not report losses; those that `Losses` finds in the messages remain
             made = subscribe()
+        draining.subscription = made
         self._subscribed.append(made)
         self.subscriptions[self._node.resolve_topic_name(topic)] = quality
 
