@@ -77,6 +77,11 @@ class OdometryClock:
         """Forget the jumps."""
         self._jumps.clear()
 
+    @property
+    def jumped(self) -> bool:
+        """Whether a jump still counts."""
+        return bool(self._jumps) and time.monotonic() - self._jumps[-1] < LASTING
+
     def faults(self) -> list[str]:
         """Return the faults, in words."""
         if len(self._jumps) < AGAIN or time.monotonic() - self._jumps[0] > LASTING:

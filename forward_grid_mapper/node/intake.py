@@ -168,6 +168,11 @@ class Intake:
         """Number of Odometry messages lost in the middleware, estimated."""
         return self._odometry_losses.lost
 
+    @property
+    def clock_jumped(self) -> bool:
+        """Whether the stamps of odometry jumped in the last seconds."""
+        return self._odometry_clock.jumped
+
     def faults(self) -> list[str]:
         """Return the faults, in words; losses and clocks are logged as well, at most every few seconds."""
         clocks = [*self._odometry_clock.faults(), *self._sensor_clocks.faults()]

@@ -89,10 +89,13 @@ class Reporter:
         # faults of frames are logged by the functions that detect them
         silent = statuses[0].message == no_map_frame or statuses[0].message.startswith(diagnostics.NO_POSE)
         bad = statuses[0].level != DiagnosticStatus.OK
-        well = statuses[0].message == diagnostics.MAPPING and not (faults or limits)
+        trajectory = self._trajectory.statuses(name)
+        # after a jump, poses are wrong although all readings are accepted
+        jumped = self._intake.clock_jumped or any(each.level != DiagnosticStatus.OK for each in trajectory)
+        well = statuses[0].message == diagnostics.MAPPING and not (faults or limits or jumped)
         self._verdicts.update([*([statuses[0].message] if bad and not silent else []), *limits], well)
         diagnostics.add_faults(statuses[0], [*faults, *limits, *self._em.wrong_input])
-        statuses += [*self._journal.statuses(name), *self._trajectory.statuses(name)]
+        statuses += [*self._journal.statuses(name), *trajectory]
         statuses.append(self._em.sensors.status(name, counts, self._silent(counts)))
         statuses.append(self._background(name))
         self._out.publish(diagnostics.array(statuses, self._node.get_clock().now().to_msg()))
