@@ -14,7 +14,7 @@ TIME_OUT = 3.0
 USUAL = 5.0
 """Time without a message, in usual intervals, after which a sensor that sends rarely is silent."""
 
-PAUSE = 1.0
+PAUSE = 0.5
 """Shortest time without a message, seconds, that counts as a pause; also at least `USUAL` intervals."""
 
 

@@ -11,8 +11,9 @@ from ..core.learning.sensor_health import SensorHealth, health_warning
 from ..core.messages.rep117 import NONE
 from .diagnostics import listed, status
 
-PAUSES, ENOUGH = 10, 100
-"""Pauses of sensors, and readings, from which a driver that sends nothing without an echo is likely."""
+PAUSES, ENOUGH, RARE = 5, 100, 1000
+"""Pauses of sensors, and readings, from which a driver that sends nothing without an echo is likely; and readings for
+each pause from which it is not."""
 
 
 def unsent_warning(pauses: int, counts: Mapping[str, tuple[int, int]]) -> str:
@@ -26,12 +27,12 @@ def unsent_warning(pauses: int, counts: Mapping[str, tuple[int, int]]) -> str:
         From `ReadingBuffer.counts`.
     """
     readings, silent = (sum(numbers[k] for numbers in counts.values()) for k in (0, 1))
-    if pauses < PAUSES or readings < ENOUGH or silent > NONE * readings:
+    if pauses < max(PAUSES, readings / RARE) or readings < ENOUGH or silent > NONE * readings:
         return ''
     return (
-        f'sensors stopped sending for a second or more, and sent again, {pauses} times so far, and hardly any reading '
-        'is without an echo: does the driver send nothing if there is no echo? It must send +inf then (REP 117), since '
-        'these readings show which space is free'
+        f'sensors stopped sending for half a second or more, and sent again, {pauses} times so far, and hardly any '
+        'reading is without an echo: does the driver send nothing if there is no echo? It must send +inf then (REP '
+        '117), since these readings show which space is free'
     )
 
 
