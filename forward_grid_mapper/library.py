@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from . import arrays
-from .core.common.errors import InputError, OutputError
+from .core.common.errors import InputError
 from .core.common.parameters import TABLE, Parameters
 from .core.common.words import counted
 from .core.mapping import Mapper, Watch
@@ -122,11 +122,7 @@ class SonarMaps:
         OutputError
             If the folder exists, or cannot be written.
         """
-        try:
-            return write_results(folder, self.maps, self.source, self.path, title, judged=self.judged)
-        except OutputError as error:
-            # the option does not exist in a program
-            raise OutputError(str(error).replace(' with -o', '')) from error
+        return write_results(folder, self.maps, self.source, self.path, title, judged=self.judged)
 
 
 def make_maps(

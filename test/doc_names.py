@@ -17,6 +17,7 @@ from forward_grid_mapper.__main__ import COMMANDS
 from forward_grid_mapper.core.common import former_parameters
 from forward_grid_mapper.core.common import parameters as table
 from forward_grid_mapper.core.messages.rep117 import ODOMETRY_REASONS, REASONS
+from forward_grid_mapper.files.parameter_file import NODE_NAME
 
 ROOT = Path(__file__).resolve().parents[1]
 PACKAGE = ROOT / 'forward_grid_mapper'
@@ -252,8 +253,8 @@ def is_spoken(name: str) -> bool:
         return True
     if f'RangeMessage.{name}' in names_in(PACKAGE / 'core' / 'messages' / 'message_types.py'):
         return True
-    # the part of a key after a colon is variable
-    keys = {text.rstrip(': ') for text in texts_in('node')}
+    # the part of a key after a colon is variable; the name of a status begins with that of the node
+    keys = {NODE_NAME, *(text.rstrip(': ') for text in texts_in('node'))}
     return name in keys | texts_in('files') or name.split(': ', maxsplit=1)[0] in keys
 
 

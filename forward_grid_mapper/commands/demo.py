@@ -79,15 +79,12 @@ def through_node(folder: Path, bag: Path, recording: Recording, options: argpars
     saved = folder / 'saved'
     ros = {'range_reliability': 'reliable', 'odom_reliability': 'reliable', 'save_directory': str(saved)}
     parameters = Parameters.from_flat(ros, base=chosen_parameters(options).parameters)
-    with LiveNode(folder, parameters, recording.extrinsics) as node:
-        ticker.say('starting the node')
-        node.call('reset')
+    with LiveNode(folder, parameters, recording.extrinsics, ticker.say) as node:
+        node.call('reset', 'starting the node')
         ticker.say(f'replaying the bag to the node, {options.rate:g} times as fast as it was recorded')
         node.run('replay_bag', str(bag), '--rate', str(options.rate), '--quiet')
-        ticker.say('running EM; the first start also compiles its code, which takes about a minute')
-        answer = node.call('run_em')
-        ticker.say('saving the maps')
-        node.call('save_maps')
+        answer = node.call('run_em', 'running EM')
+        node.call('save_maps', 'saving the maps')
     # the only folder there; the answer's text is for people, and cannot be parsed for any path
     (made,) = saved.iterdir()
     made.rename(folder / 'maps')

@@ -6,7 +6,7 @@ import os
 import subprocess
 import sys
 import time
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import ExitStack
 from pathlib import Path
 from types import TracebackType
@@ -15,13 +15,18 @@ from typing import Any
 from ..core.common.errors import MapperError
 from ..core.common.parameters import Parameters
 from ..core.messages.message_types import Pose2
+from ..files.parameter_file import NODE_NAME
 from ..files.parameter_text import dump_parameters
 from .domain import own_domain
 from .signals import ENDS_WITH_STDIN
 
-NODE = '/forward_grid_mapper'
-START = 180.0
-"""Longest time for the start of the node, seconds: the first start compiles."""
+SILENCE = 180.0
+"""Longest wait for the node to start or to answer while it does not compile, seconds."""
+
+COMPILATION = 3600.0
+"""Longest wait for an answer if the node compiles, seconds; slow computers need many minutes."""
+
+MOST = f'at most {COMPILATION / 60:.0f} minutes'
 
 ORDERLY = 15.0
 """Seconds before a child that does not end is killed; the node ends itself after 5."""
@@ -54,14 +59,63 @@ def end_child(process: subprocess.Popen[bytes]) -> None:
         process.stdin.close()
 
 
+class Limit:
+    """The end of the wait for an answer; it is moved while the node reports that it compiles kernels.
+
+    Attributes
+    ----------
+    compiling : str
+        What the node has to compile, in its words; '' if nothing.
+    """
+
+    def __init__(self, now: Callable[[], float] = time.monotonic) -> None:
+        """`now` returns monotonic seconds."""
+        self._now = now
+        self.compiling = ''
+        self.begin()
+
+    def begin(self) -> None:
+        """Begin to wait."""
+        now = self._now()
+        self._end, self._last = now + SILENCE, now + COMPILATION
+
+    def hear(self, diagnostics: Any) -> None:
+        """Receive a message on `/diagnostics`."""
+        for status in diagnostics.status:
+            for pair in status.values:
+                if status.name == f'{NODE_NAME}: background' and pair.key == 'kernels':
+                    # otherwise it is idle, or compilation has failed
+                    self.compiling = pair.value if pair.value.endswith('to do') else ''
+        if self.compiling:
+            self._end = min(self._now() + SILENCE, self._last)
+
+    @property
+    def passed(self) -> str:
+        """What is wrong if the wait must end now, with a remedy; otherwise ''."""
+        if self._now() < self._end:
+            return ''
+        if self._end < self._last or not self.compiling:
+            return f'the node has not answered for {SILENCE:.0f} s'
+        return (
+            f'the node still compiles after {COMPILATION / 60:.0f} minutes; compile without it, with '
+            'python3 -m forward_grid_mapper warm_up, and repeat the command'
+        )
+
+
 class LiveNode:
     """Starts the node with given parameters in a DDS domain of its own, and calls its services.
 
     Used as a context manager.
     """
 
-    def __init__(self, folder: Path, parameters: Parameters, extrinsics: Iterable[tuple[str, Pose2]]) -> None:
-        """`folder` is for the node's parameters and its log."""
+    def __init__(
+        self,
+        folder: Path,
+        parameters: Parameters,
+        extrinsics: Iterable[tuple[str, Pose2]],
+        tell: Callable[[str], object] = lambda text: None,
+    ) -> None:
+        """`folder` is for the node's parameters and its log; `tell` receives what is waited for."""
         self._folder = folder
         self._log = folder / 'node.log'
         lines = [dump_parameters(parameters), '\n    # ---- Poses of the sensors on the robot\n\n']
@@ -71,6 +125,8 @@ class LiveNode:
         self._domain = ExitStack()
         self._client: Any = None
         self._process: subprocess.Popen[bytes] | None = None
+        self._tell = tell
+        self._limit = Limit()
 
     def __enter__(self) -> LiveNode:
         """Start the node; if anything else fails, end it."""
@@ -93,7 +149,10 @@ class LiveNode:
         from rclpy.signals import SignalHandlerOptions
 
         rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
-        self._client = rclpy.create_node('forward_grid_mapper_demo')
+        from diagnostic_msgs.msg import DiagnosticArray
+
+        self._client = rclpy.create_node(f'{NODE_NAME}_demo')
+        self._client.create_subscription(DiagnosticArray, '/diagnostics', self._limit.hear, 10)
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
@@ -126,37 +185,44 @@ class LiveNode:
         if code != 0:
             raise MapperError(f'{arguments[0]} failed; {self._last_words()}')
 
-    def call(self, service: str) -> str:
-        """Call a service of type Trigger; return its message.
+    def call(self, service: str, what: str) -> str:
+        """Call a service of type Trigger; return its message. `what` describes the call.
 
         Raises
         ------
         MapperError
             If the node ends or does not answer, or the service reports a failure.
         """
-        import rclpy
         from std_srvs.srv import Trigger
 
-        client = self._client.create_client(Trigger, f'{NODE}/{service}')
-        end = time.monotonic() + START
-        while not client.service_is_ready():
-            self._check(end)
-            time.sleep(0.05)
+        client = self._client.create_client(Trigger, f'/{NODE_NAME}/{service}')
+        self._wait(client.service_is_ready, what)
         future = client.call_async(Trigger.Request())
-        end = time.monotonic() + START
-        while not future.done():
-            self._check(end)
-            rclpy.spin_once(self._client, timeout_sec=0.1)
+        self._wait(future.done, what)
         answer = future.result()
         if not answer.success:
             raise MapperError(f'{service}: {answer.message}; {self._last_words()}')
         return str(answer.message)
 
-    def _check(self, end: float) -> None:
-        if self._process is None or self._process.poll() is not None:
-            raise MapperError(f'the node ended; {self._last_words()}')
-        if time.monotonic() >= end:
-            raise MapperError(f'the node does not answer; {self._last_words()}')
+    def _wait(self, done: Callable[[], bool], what: str) -> None:
+        """Turn the client until something is done.
+
+        Raises
+        ------
+        MapperError
+            If the node ends or does not answer.
+        """
+        import rclpy
+
+        self._limit.begin()
+        while not done():
+            if self._process is None or self._process.poll() is not None:
+                raise MapperError(f'the node ended; {self._last_words()}')
+            if why := self._limit.passed:
+                raise MapperError(f'{what}: {why}; {self._last_words()}')
+            left = self._limit.compiling
+            self._tell(f'{what}: waiting until the node has compiled its kernels ({left}), {MOST}' if left else what)
+            rclpy.spin_once(self._client, timeout_sec=0.1)
 
     def _last_words(self) -> str:
         lines = self._log.read_text(errors='replace').splitlines() if self._log.exists() else []

@@ -97,6 +97,7 @@ def with_workers(
 
     output = Path(options.output) if options.output else free_name(Path.cwd(), default)
     work = WorkFolder(str(Path(options.work or beside(output)).resolve()))
+    check_apart(output, work.root)
     memory = int((options.memory_per_worker or MEMORY) * 1e9)
     size = TILE if options.tiles is None else options.tiles
     meant = find_recordings(options.bags)
@@ -149,6 +150,32 @@ def with_workers(
 def beside(output: Path) -> Path:
     """Return the work folder of a job that writes to `output`: beside it, also if that is `.`."""
     return Path(f'{os.path.abspath(output)}.work')  # noqa: PTH100 (as in `output_folder`)
+
+
+def check_apart(output: Path, work: Path) -> None:
+    """Check that neither the results nor the work folder would be inside the other.
+
+    Results need an empty folder at the end of the job, and the work folder is deleted then with all that it contains.
+
+    Raises
+    ------
+    ParameterError
+        If one is the other, or inside it; links are followed.
+    """
+    results = Path(os.path.realpath(os.path.abspath(output)))  # noqa: PTH100 (as in `output_folder`)
+    inner = work.resolve()
+    if inner == results:
+        where = 'is the folder of the results'
+    elif results in inner.parents:
+        where = f'is inside the folder of the results, {readable(results)}'
+    elif inner in results.parents:
+        where = f'contains the folder of the results, {readable(results)}'
+    else:
+        return
+    raise ParameterError(
+        f'--work {readable(work)} {where}, and the work folder is deleted at the end: choose one outside the results, '
+        'or leave out --work'
+    )
 
 
 def _check(options: argparse.Namespace) -> None:

@@ -27,8 +27,7 @@ from ..files.output_folder import free_name, output_folder, readable
 from ..files.picture import NOWHERE
 from ..files.quality_warning import NOT_CONVERGED
 from ..files.report import report_text
-from ..files.rerun_recording import NAME as RECORDING
-from ..files.rerun_recording import check_rerun, write_rerun
+from ..files.rerun_recording import RECORDING, check_rerun, write_rerun
 from ..files.results import write_results
 from ..recordings.drive import jumps_note
 from ..recordings.drives import Drives, read_drives

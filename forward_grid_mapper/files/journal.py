@@ -4,6 +4,9 @@ The folder contains `drive_0001.journal`, `drive_0002.journal` and so on, a new 
 which only one node at a time can write. While a node writes, SQLite's log (`drive_0001.journal-wal`) is beside its
 file. Nothing is ever deleted.
 
+A file that cannot be continued stays as it is. The next one names it, and gets a copy of its readings; until then, they
+are read from the old one at each start, see `journal_format`.
+
 A thread commits rows as soon as it receives them; killing the process does not undo this: `synchronous=NORMAL` waits
 for the disk only when SQLite moves its log into the file, once in 4 MB. A second thread syncs the log once a second,
 so that a power cut loses little more than a second. The node's own thread never waits for the disk.
@@ -13,6 +16,7 @@ from __future__ import annotations
 
 import itertools
 import json
+import os
 import sqlite3
 import threading
 import time
@@ -22,10 +26,10 @@ from typing import Any
 
 from ..core.common.errors import BagError, OutputError
 from ..core.common.readings import Readings
-from .journal_backlog import Backlog, Everything, Item
-from .journal_database import DRIVE, FULL, Drive, DriveWriter, FolderLock, GoneError, following, number_of
-from .journal_format import Contents, Insert, encoded, path_rows, reading_rows
-from .journal_reader import is_journal, one_line, read
+from .journal_backlog import Backlog, Copied, Everything, Item, StoppedError
+from .journal_database import FULL, Drive, DriveWriter, FolderLock, GoneError, following, number_of
+from .journal_format import DRIVE, OWN, Contents, Insert, encoded, path_rows, reading_rows
+from .journal_reader import is_journal, one_line, read_earlier
 from .output_folder import expanded, output_errors
 from .syncing import Syncer
 
@@ -93,9 +97,12 @@ class Journal:
         Raises
         ------
         OutputError
-            If another process has locked it, or the folder cannot be made or written.
+            If another process has locked it, or the folder is a file, or cannot be made or written.
         """
         self.folder = expanded(folder).absolute()
+        if os.path.lexists(self.folder) and not self.folder.is_dir():
+            inside = f': give {self.folder.parent}' if DRIVE.fullmatch(self.folder.name) else ''
+            raise OutputError(f'{self.folder} is a file, but a journal is a folder{inside}')
         self._warn = warn
         self.trouble = self.notice = ''
         self.noticed = 0.0
@@ -121,7 +128,7 @@ class Journal:
         self._drive = Drive(self._source or self.folder / 'drive_0001.journal', made=bool(found))
         self._numbers: dict[str, int] = {}
         self._stated: tuple[Any, ...] = ()
-        self._next = self._next_points = 0
+        self._next = self._next_points = self._copied = 0
 
     @property
     def path(self) -> Path:
@@ -141,7 +148,8 @@ class Journal:
     def restore(self) -> Iterator[Readings]:
         """Yield the readings of the current drive, and begin to accept new ones.
 
-        A file that is damaged, or has the previous format, is not changed: its readings are written to a new one.
+        A file that is damaged, or has the previous format, is not changed: a new one continues it, into which its
+        readings are copied in the background.
 
         Raises
         ------
@@ -150,39 +158,60 @@ class Journal:
         """
         source, contents = self._source, self.contents
         if source is not None and self._writer.resume(self._drive):
-            yield from self._writer.readings(contents)
+            yield from self._writer.readings(contents, self._earlier)
             # it was valid a moment ago
             self._drive.gone = bool(contents.harm)
             self._numbers = {name: number for number, name in contents.sensors.items()}
             self._stated = (contents.map_frame, contents.base_frame, contents.parameters)
             self._next, self._next_points = contents.next, contents.next_points
+            if contents.continues:
+                self._next, self._next_points = max(self._next, OWN), max(self._next_points, OWN)
             self._work_in_background()
-            return
-        if self._closing:
-            # a file that was closed meanwhile seems to be damaged
-            return
-        if source is not None:
-            self._drive = Drive(following(source))
-        self._work_in_background()
-        # the file must exist before the first reading
-        self._queue((), 0, 0)
-        self._wait_for(lambda: self._drive.made)
-        if source is not None:
-            yield from self._carry_over(source)
+        else:
+            if self._closing:
+                # a file that was closed meanwhile seems to be damaged
+                return
+            if source is not None:
+                contents.continues = source.name
+                self._drive = Drive(following(source), continues=source.name)
+                self._next = self._next_points = OWN
+            self._work_in_background()
+            # the file must exist before the first reading
+            self._queue((), 0, 0)
+            self._wait_for(lambda: self._drive.made)
+            if source is not None:
+                yield from self._earlier()
+        if contents.continues and not self._drive.gone and not self._closing:
+            self._copy_earlier()
 
-    def _carry_over(self, source: Path) -> Iterator[Readings]:
-        """Yield the readings of a file that cannot be continued, and write them to a new one."""
-        contents = self.contents
-        try:
-            for found in read(source, contents):
-                yield found
-                self.put(found, (contents.map_frame, contents.base_frame))
-                self._wait_for(lambda: self._backlog.bytes <= MOST_PENDING // 2)
-        except BagError as error:
-            self._notice(f'{error}; the journal continues in {self.path.name}')
-        self.put(None, (contents.map_frame, contents.base_frame), contents.path)
-        for text in filter(None, (contents.note, contents.harm)):
-            self._notice(f'{source}: {text}; the journal continues in {self.path.name}')
+    def _earlier(self) -> Iterator[Readings]:
+        """Yield the readings of the file that the current one continues."""
+        for readings in read_earlier(self.path, self.contents):
+            self._copied += len(readings)
+            yield readings
+
+    def _copy_earlier(self) -> None:
+        """Copy these readings in the background; if some cannot be read now, a later start does."""
+        contents, path = self.contents, self.path
+        files = list(contents.earlier_files(path))
+        for file, earlier in files:
+            for text in filter(None, (earlier.note, earlier.harm)):
+                self._notice(f'{file}: {text}; the journal continues in {path.name}')
+        names = [name for _, earlier in files for name in earlier.sensors.values()]
+        # until the node states its own; the file may have none
+        self.parameters, self._stated = dict(contents.parameters), ()
+        self._put_rows(self._head(names, (contents.map_frame, contents.base_frame)), 0)
+        if contents.unread:
+            self._notice(
+                f'{contents.unread}; the journal continues in {path.name}, and each start tries again until the file '
+                'is removed'
+            )
+        else:
+            if not self._copied:
+                # perhaps it was removed before, so it need not stay
+                self._drive.continues = ''
+            rows = Copied(path, contents.continues, dict(self._numbers), self._copied, lambda: self._closing)
+            self._queue(rows, self._copied, 0)
 
     def put(self, readings: Readings | None, frames: tuple[str, str], path: Iterable[tuple[float, float]] = ()) -> None:
         """Append readings, new points of the robot's path, and the map and base frame if they are new."""
@@ -194,15 +223,14 @@ class Journal:
                 )
             self.lost += count
             return
-        rows = self._head(readings, frames)
+        rows = self._head(() if readings is None else readings.sensor_names, frames)
         points = list(path_rows(list(path), self._next_points))
         self._next_points += len(points)
         rows += points
         if readings is not None:
             rows += reading_rows(readings, self._numbers, self._next)
         self._next += count
-        if rows:
-            self._queue(rows, count, sum(len(values[-1]) for _, values in rows))
+        self._put_rows(rows, count)
 
     def begin_drive(self) -> None:
         """Continue in a new file; the old one is kept, or the current one continues if nothing was written yet."""
@@ -212,13 +240,14 @@ class Journal:
 
     def renew(self, readings: Readings, frames: tuple[str, str], path: Iterable[tuple[float, float]]) -> None:
         """Continue in a new file, which begins with all readings in memory, since the current one is `gone`."""
-        self._begin()
+        # readings that could not be read are not in memory
+        self._begin(self._drive.continues if self.contents.unread and not self._copied else '')
         # also those that could not be written before
         self.lost = 0
-        head = self._head(readings, frames)
-        points = list(path)
-        self._next, self._next_points = len(readings), len(points)
-        self._queue(Everything(head, readings, dict(self._numbers), points), len(readings), 0)
+        head = self._head(readings.sensor_names, frames)
+        points, first = list(path), self._next
+        self._next, self._next_points = first + len(readings), first + len(points)
+        self._queue(Everything(head, readings, dict(self._numbers), points, first), len(readings), 0)
 
     def close(self, seconds: float = 2.0) -> None:
         """Write the remaining rows if this takes at most so many seconds, and unlock the folder."""
@@ -234,33 +263,39 @@ class Journal:
         if not thread.is_alive():
             syncer.close(seconds)
 
-    def _begin(self) -> None:
-        """Begin a new drive with its file."""
+    def _begin(self, continues: str = '') -> None:
+        """Begin a new drive with its file, which may continue an earlier one."""
         with self._wake:
             if self._drive.gone:
                 # rows for a file that will not return
                 self._backlog.drop(self._drive)
-            self._drive = Drive(following(self._drive.path))
+            self._drive = Drive(following(self._drive.path), continues=continues)
         self._numbers, self._stated = {}, ()
-        self._next = self._next_points = 0
+        self._next = self._next_points = OWN if continues else 0
         self._queue((), 0, 0)
 
-    def _head(self, readings: Readings | None, frames: tuple[str, str]) -> list[Insert]:
-        """Return the rows that must precede those of the readings."""
+    def _head(self, names: Iterable[str], frames: tuple[str, str]) -> list[Insert]:
+        """Return the rows that must precede those of readings of these sensors."""
         rows: list[Insert] = []
         stated = (*frames, self.parameters)
         if stated != self._stated:
             self._stated = (*frames, dict(self.parameters))
             rows.append(('drive', (0, *map(encoded, frames), json.dumps(self.parameters).encode())))
-        for name in readings.sensor_names if readings is not None else ():
+        for name in names:
             if name not in self._numbers:
                 self._numbers[name] = max(self._numbers.values(), default=-1) + 1
                 rows.append(('sensors', (self._numbers[name], encoded(name))))
         return rows
 
+    def _put_rows(self, rows: list[Insert], readings: int) -> None:
+        if rows:
+            self._queue(rows, readings, sum(len(values[-1]) for _, values in rows))
+
     def _queue(self, rows: Iterable[Insert], readings: int, size: int) -> None:
+        # `OWN` is no number of a reading yet
+        written = 0 if self._next == OWN else self._next
         with self._wake:
-            self._backlog.append(Item(self._drive, rows, readings, size, self._next))
+            self._backlog.append(Item(self._drive, rows, readings, size, written))
             self._wake.notify_all()
 
     # in the background
@@ -291,6 +326,7 @@ class Journal:
                 if not items and self._closing:
                     break
             try:
+                self._check_continued()
                 if items:
                     self._write(items)
                 else:
@@ -300,7 +336,7 @@ class Journal:
                 self._give_up_file(error.drive, str(error))
             except Exception as error:
                 # of any class: the thread must not end silently
-                if not self._smaller(items) and self._failed(error):
+                if not self._smaller(items) and not self._put_off(items, error) and self._failed(error):
                     break
         self._let_go()
         syncer.close(0.0)
@@ -310,9 +346,19 @@ class Journal:
         log = self._writer.write(items[0].drive, rows, items[-1].following)
         assert self._syncer is not None
         self._syncer.changed(log)
+        if isinstance(items[0].rows, Copied):
+            items[0].drive.continues = ''
+            self._writer.empty_log()
         with self._wake:
             self._backlog.written(items)
             self._wake.notify_all()
+
+    def _check_continued(self) -> None:
+        """Raise an error if readings in memory are no longer in a file, since the file with them was removed."""
+        drive = self._drive
+        only_there = self._copied and drive.continues and not drive.gone
+        if only_there and not os.path.lexists(drive.path.with_name(drive.continues)):
+            raise GoneError(drive, f'{drive.continues}, which it continues, was removed')
 
     def _steady(self) -> None:
         """End the trouble if nothing has failed for a while."""
@@ -339,6 +385,22 @@ class Journal:
         with self._wake:
             return bool(items) and self._backlog.halve(items)
 
+    def _put_off(self, items: list[Item], error: Exception) -> bool:
+        """Leave a failed copy to the next start, so that new readings do not wait for it; return whether it was one."""
+        rows = items[0].rows if items else None
+        if not isinstance(rows, Copied):
+            return False
+        self._writer.empty_log()
+        if not isinstance(error, StoppedError):
+            self._notice(
+                f'journal {rows.path}: the readings of {rows.continues} cannot be copied: {_words(error)}; the next '
+                'start tries it again, so keep both files'
+            )
+        with self._wake:
+            self._backlog.written(items)
+            self._wake.notify_all()
+        return True
+
     def _failed(self, error: Exception) -> bool:
         """Report a failed write, and wait before the next attempt; return whether to give up."""
         trouble = _words(error)
@@ -361,4 +423,4 @@ def _words(error: Exception) -> str:
         return 'No space left on device' if FULL in text else text
     if isinstance(error, OSError):
         return error.strerror or str(error)
-    return str(error) if isinstance(error, OutputError) else repr(error)
+    return str(error) if isinstance(error, (OutputError, BagError)) else repr(error)

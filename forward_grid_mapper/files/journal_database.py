@@ -10,31 +10,32 @@ from __future__ import annotations
 import errno
 import fcntl
 import os
-import re
 import sqlite3
 import threading
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import closing, suppress
 from dataclasses import dataclass
 from pathlib import Path
 
 from ..core.common.errors import BagError, OutputError
 from ..core.common.readings import Readings
-from .journal_format import APPLICATION, ROW, TABLES, VERSION, Contents, Insert
+from .journal_format import APPLICATION, CONTINUES, DRIVE, ROW, TABLES, VERSION, Contents, Insert
 from .journal_reader import check, connect, extent, log_of, one_line, readings, unbounded
-
-DRIVE = re.compile(r'drive_(\d{4,})\.journal')
 
 PARTIAL = '.new.journal'
 """Name of a file before it is complete; an old one is overwritten."""
 
 INSERT = {
     'drive': 'INSERT OR REPLACE INTO drive VALUES (?, ?, ?, ?)',
+    'whole': 'DELETE FROM drive WHERE number = ?',
     'sensors': 'INSERT OR IGNORE INTO sensors VALUES (?, ?)',
     'path': 'INSERT OR IGNORE INTO path VALUES (?, ?)',
     'readings': 'INSERT OR IGNORE INTO readings VALUES (?, ?)',
 }
-"""Existing rows are ignored, except that of the drive, so that a commit with unknown outcome can be repeated."""
+"""Existing rows are ignored, except that of the drive, so that a commit with unknown outcome can be repeated.
+
+`whole` is no table: it removes the name of the file that is continued.
+"""
 
 FULL = 'database or disk is full'
 """SQLite's message for a full disk; the transaction may be repeated with the same connection."""
@@ -54,12 +55,15 @@ class Drive:
         Whether it vanished or was damaged since.
     next : int
         Number of the first reading after the committed ones.
+    continues : str
+        Name of the file with its earlier readings, as long as these were not copied; '' if there is none.
     """
 
     path: Path
     made: bool = False
     gone: bool = False
     next: int = 0
+    continues: str = ''
 
 
 class GoneError(Exception):
@@ -171,7 +175,7 @@ class DriveWriter:
             contents = Contents()
             for _ in self.readings(contents):
                 pass
-            drive.next = contents.next
+            drive.next, drive.continues = contents.next, contents.continues
             if not contents.harm and self._database is not None:
                 return True
         except sqlite3.OperationalError as error:
@@ -184,11 +188,11 @@ class DriveWriter:
         self.close()
         return False
 
-    def readings(self, contents: Contents) -> Iterator[Readings]:
-        """Yield the readings of the open file, and fill `contents`; none after `end`."""
+    def readings(self, contents: Contents, earlier: Callable[[], Iterable[Readings]] = tuple) -> Iterator[Readings]:
+        """Yield the readings of the open file as `journal_reader.readings` does; none after `end`."""
         database = self._database
         if database is not None:
-            yield from readings(database, self._size, contents)
+            yield from readings(database, self._size, contents, earlier)
 
     def write(self, drive: Drive, rows: Iterable[Insert], following: int) -> Path:
         """Commit rows to the file of a drive, which is created if needed; return SQLite's log, which contains them.
@@ -228,6 +232,15 @@ class DriveWriter:
             self.close()
             raise
         return log_of(drive.path)
+
+    def empty_log(self) -> None:
+        """Move the rows of the log into the file and truncate it, if possible: it keeps the size of a large commit."""
+        if self._database is not None:
+            with suppress(sqlite3.Error):
+                self._database.execute('PRAGMA wal_checkpoint(TRUNCATE)')
+            # the next check finds a file that vanished
+            with suppress(GoneError):
+                self._remember()
 
     def check_file(self) -> None:
         """Check that the open file and its log exist, and are not shorter than they were.
@@ -328,6 +341,9 @@ class DriveWriter:
             database.execute('BEGIN IMMEDIATE')
             for sql in TABLES.values():
                 database.execute(sql)
+            if drive.continues:
+                values = (CONTINUES, None, None, drive.continues.encode())
+                database.execute(INSERT['drive'], values)
             database.execute(f'PRAGMA application_id={APPLICATION}')
             database.execute(f'PRAGMA user_version={VERSION}')
             database.execute('COMMIT')

@@ -2,22 +2,29 @@
 
 A journal file is an SQLite database in WAL mode:
 
-    drive      one row: map_frame and base_frame (UTF-8), and the parameters of the node that wrote it (JSON)
+    drive      row 0: map_frame and base_frame (UTF-8), and the parameters of the node that wrote it (JSON);
+               row 1, if the file continues an earlier one: the name of that file
     sensors    number of a sensor, and its frame_id in UTF-8
     path       points of the robot's path in the map frame: x, y (float64)
     readings   number of the first reading of a block, and the block: rows of `ROW`
 
 Readings are counted from the begin of the drive. The count is the key of the table, so that a block that is written
 again after a failure is not stored twice.
+
+A file that continues an earlier one lacks the readings of that one, and counts its own from `OWN`. The readings of the
+earlier file are inserted before them, and row 1 of `drive` is removed, in one transaction. So at each moment, every
+reading is in the file or in the one that it continues, and never in both.
 """
 
 from __future__ import annotations
 
 import json
+import re
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -28,6 +35,9 @@ from ..core.common.parameters import TABLE, Parameters
 from ..core.common.readings import Readings
 from ..core.messages.map_extent import FARTHEST
 from ..core.messages.message_types import NANOSECONDS
+
+DRIVE = re.compile(r'drive_(\d{4,})\.journal')
+"""Name of a journal file."""
 
 SQLITE = b'SQLite format 3\0'
 """The first bytes of every SQLite database."""
@@ -45,6 +55,12 @@ TABLES = {
     'readings': 'CREATE TABLE readings (number INTEGER PRIMARY KEY, rows BLOB)',
 }
 """The whole schema. No table has its own index, so that `sqlite_master` has exactly these rows."""
+
+CONTINUES = 1
+"""Number of the row of `drive` with the name of the file that is continued."""
+
+OWN = 1 << 39
+"""Number of the first own reading, and of the first own points of the path, in a file that continues another one."""
 
 COLUMNS = ('x', 'y', 'yaw', 'z', 'z_max', 'half_angle', 'sigma')
 ROW = np.dtype([('stamp', '<i8'), *((name, '<f8') for name in COLUMNS), ('sensor', '<u4')])
@@ -135,6 +151,12 @@ class Contents:
         Number of invalid readings by fault; they are not yielded.
     note : str
         A note to the user on a valid file; '' if none.
+    continues : str
+        Name of the file that has the earlier readings of the drive; '' if the file has all of them.
+    earlier : Contents or None
+        Contents of that file, once it was read.
+    unread : str
+        Reason why readings were not read that may be readable later; '' if there are none. Also that of earlier files.
     """
 
     map_frame: str = ''
@@ -147,6 +169,9 @@ class Contents:
     faults: list[str] = field(default_factory=list)
     left_out: Counter[str] = field(default_factory=Counter)
     note: str = ''
+    continues: str = ''
+    earlier: Contents | None = None
+    unread: str = ''
 
     @property
     def harm(self) -> str:
@@ -196,6 +221,32 @@ class Contents:
                 with suppress(ParameterError):
                     self.parameters[row.name] = row.check(values[row.name])
 
+    def set_continued(self, name: object) -> None:
+        """Set the file that is continued, if it is one of a journal's folder."""
+        text = _name(name)
+        if text is None or not DRIVE.fullmatch(text):
+            self.fault('the name of the file that it continues is damaged')
+        else:
+            self.continues = text
+
+    def put_before(self, earlier: Contents) -> None:
+        """Add what the file lacks and `earlier`, which it continues, has."""
+        self.earlier = earlier
+        self.path[:0] = earlier.path
+        self._thin_path()
+        self.unread = self.unread or earlier.unread
+        # not yet stated by the node that continues
+        if not self.map_frame:
+            self.map_frame, self.base_frame = earlier.map_frame, earlier.base_frame
+            self.parameters = dict(earlier.parameters)
+
+    def earlier_files(self, path: Path) -> Iterator[tuple[Path, Contents]]:
+        """Yield the files that `path` continues, the latest one first, and their contents."""
+        contents = self
+        while contents.earlier is not None:
+            path, contents = path.with_name(contents.continues), contents.earlier
+            yield path, contents
+
     def add_path(self, data: object) -> None:
         """Add points of the path, if they are on Earth."""
         if not isinstance(data, bytes) or len(data) % 16:
@@ -206,6 +257,9 @@ class Contents:
         if not good.all():
             self.fault('points of the path are not finite')
         self.path += [(x, y) for x, y in points[good].tolist()]
+        self._thin_path()
+
+    def _thin_path(self) -> None:
         while len(self.path) > MOST_POINTS:
             del self.path[1::2]
 

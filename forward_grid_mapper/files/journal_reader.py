@@ -17,7 +17,7 @@ import sqlite3
 import stat
 import sys
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import closing, contextmanager, suppress
 from pathlib import Path
 from typing import Any
@@ -31,6 +31,7 @@ from ..core.common.readings import Readings
 from . import journal_previous
 from .journal_format import (
     APPLICATION,
+    CONTINUES,
     LONGEST,
     ROW,
     SQLITE,
@@ -70,6 +71,12 @@ LEAST_STEPS = 1_000_000
 STEPS_A_BYTE = 4
 """Steps that are allowed for each byte of the file: a row needs about 15, and has 10 bytes or more."""
 
+INTERRUPTED = 'interrupted'
+"""SQLite's message if these steps are exceeded."""
+
+MOST_FILES = 50
+"""Most files that continue each other; each one but the last could not be read when the next one began."""
+
 MOST_MEMORY = 256 << 20
 """Most memory of SQLite, bytes, for Python 3.10, which cannot bound the length of a value; a hundred times its need."""
 
@@ -92,8 +99,10 @@ def log_of(path: Path) -> Path:
     return path.with_name(path.name + '-wal')
 
 
-def read(path: Path, contents: Contents) -> Iterator[Readings]:
+def read(path: Path, contents: Contents, newer: tuple[str, ...] = ()) -> Iterator[Readings]:
     """Yield the readings of a journal file, about `journal_format.CHUNK` at a time, and fill `contents`.
+
+    Those of the files that it continues come first. `newer` has the names of the files that continue this one.
 
     Raises
     ------
@@ -106,11 +115,30 @@ def read(path: Path, contents: Contents) -> Iterator[Readings]:
             return
         with _for_reading(path) as (database, size):
             check(database, path)
-            yield from readings(database, size, contents)
+            yield from readings(database, size, contents, lambda: read_earlier(path, contents, newer))
     except OSError as error:
         raise BagError(f'{path} cannot be read: {error.strerror or error}') from error
     except (sqlite3.Error, MemoryError) as error:
         raise BagError(f'{path} cannot be read: {one_line(error)}') from error
+
+
+def read_earlier(path: Path, contents: Contents, newer: tuple[str, ...] = ()) -> Iterator[Readings]:
+    """Yield the readings of the file that `path` continues, and add what it has to the contents of `path`.
+
+    If it cannot be read, `contents.unread` is the reason.
+    """
+    source = path.with_name(contents.continues)
+    earlier, newer = Contents(), (*newer, path.name)
+    try:
+        if contents.continues in newer or len(newer) > MOST_FILES:
+            raise BagError(f'{path.name} is one of too many files that continue each other')
+        yield from read(source, earlier, newer)
+    except BagError as error:
+        if os.path.lexists(source):
+            earlier.unread = str(error)
+        else:
+            earlier.fault(f'it was removed, so {path.name} lacks its readings')
+    contents.put_before(earlier)
 
 
 def extent(path: Path) -> int:
@@ -185,23 +213,31 @@ def check(database: sqlite3.Connection, path: Path) -> None:
         raise BagError(f'{path} has other tables than a journal, so it is not read')
 
 
-def readings(database: sqlite3.Connection, size: int, contents: Contents) -> Iterator[Readings]:
+def readings(
+    database: sqlite3.Connection, size: int, contents: Contents, earlier: Callable[[], Iterable[Readings]] = tuple
+) -> Iterator[Readings]:
     """Yield the readings of a database that passed `check`, and fill `contents`.
 
-    A part that cannot be read is noted in `contents`, and nothing after it is read.
+    `earlier` gives the readings of the file that this one continues; it is called if there is one, and without it they
+    are left out. A part that cannot be read is noted in `contents`, and nothing after it is read.
     """
     table = _Table(database, size)
     try:
-        for _, map_frame, base_frame, parameters in table.rows('drive', 'map_frame', 'base_frame', 'parameters'):
-            contents.set_frames(map_frame, base_frame)
-            contents.set_parameters(parameters)
+        for number, map_frame, base_frame, text in table.rows('drive', 'map_frame', 'base_frame', 'parameters'):
+            if number == CONTINUES:
+                contents.set_continued(text)
+            else:
+                contents.set_frames(map_frame, base_frame)
+                contents.set_parameters(text)
         for number, name in table.rows('sensors', 'name'):
             contents.add_sensor(number, name)
         for number, points in table.rows('path', 'points'):
             contents.add_path(points)
             contents.next_points = number + 1
     except (sqlite3.Error, MemoryError, _DamagedError) as error:
-        contents.fault(f'its data other than readings cannot be read: {one_line(error)}')
+        _note(contents, f'its data other than readings cannot be read: {one_line(error)}', error)
+    if contents.continues:
+        yield from earlier()
     yield from in_chunks(_blocks(table, contents), contents)
 
 
@@ -218,7 +254,14 @@ def _blocks(table: _Table, contents: Contents) -> Iterator[NDArray[np.void]]:
             contents.next = number + len(rows)
             yield rows
     except (sqlite3.Error, MemoryError, _DamagedError) as error:
-        contents.fault(f'it cannot be read to its end: {one_line(error)}')
+        _note(contents, f'it cannot be read to its end: {one_line(error)}', error)
+
+
+def _note(contents: Contents, fault: str, error: Exception) -> None:
+    contents.fault(fault)
+    # SQLite reports damage by the class above that of these
+    if isinstance(error, (sqlite3.OperationalError, MemoryError)) and INTERRUPTED not in str(error):
+        contents.unread = fault
 
 
 class _DamagedError(Exception):
@@ -258,7 +301,7 @@ class _Table:
 def one_line(error: BaseException) -> str:
     """Return the message of SQLite in one line."""
     text = ' '.join(str(error).split()) or type(error).__name__
-    return 'it is damaged: reading it takes more steps than it has bytes' if text == 'interrupted' else text
+    return 'it is damaged: reading it takes more steps than it has bytes' if text == INTERRUPTED else text
 
 
 @contextmanager

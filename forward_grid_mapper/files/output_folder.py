@@ -15,6 +15,11 @@ from pathlib import Path
 
 from ..core.common.errors import OutputError
 
+
+class TakenError(OutputError):
+    """Another run writes the folder, or has made it meanwhile."""
+
+
 _STAGING = re.compile(r'\.(?P<name>.+)\.[0-9a-f]{8}\.partial')
 _FULL = {errno.ENOSPC, errno.EDQUOT}
 # Errors that only writing can cause, so that they are always errors of the output.
@@ -104,7 +109,9 @@ def output_folder(path: Path | str) -> Iterator[Path]:
     Raises
     ------
     OutputError
-        If the folder is not empty, cannot be made, or the disk is full, or if another run writes it now.
+        If the folder is not empty, cannot be made, or the disk is full.
+    TakenError
+        If another run writes it now, or has made it when the block has succeeded.
     """
     final = Path(os.path.abspath(path))  # noqa: PTH100 (links are kept, so no resolve)
     with output_errors(final):
@@ -129,7 +136,7 @@ def output_folder(path: Path | str) -> Iterator[Path]:
         done = True
     except OutputError as error:
         # users do not know the temporary name
-        raise OutputError(str(error).replace(str(staging), str(final))) from error
+        raise type(error)(str(error).replace(str(staging), str(final))) from error
     except OSError as error:
         if error.errno in _WRITE_ONLY:
             raise _output_error(final, error) from error
@@ -166,38 +173,58 @@ def _remove_abandoned(final: Path) -> None:
 
     Raises
     ------
-    OutputError
+    TakenError
         If one is of a run that still writes.
     """
     for parent in (final, final.parent):
-        try:
-            names = os.listdir(parent)  # noqa: PTH208 (names of any bytes, and few of them)
-        except OSError:
-            # not made yet, or not a folder, or the reason why it cannot be written is found next
+        if final.name in remove_abandoned(parent, re.compile(re.escape(final.name))):
+            raise TakenError(f'another run writes {final} now; wait until it has ended, or choose another folder')
+
+
+def remove_abandoned(parent: Path, names: re.Pattern[str]) -> set[str]:
+    """Remove the temporary folders in `parent` that runs left when they were killed.
+
+    Parameters
+    ----------
+    parent : Path
+    names : pattern
+        Final names of the folders to remove.
+
+    Returns
+    -------
+    set of str
+        Final names of those that other runs write now.
+    """
+    in_use: set[str] = set()
+    try:
+        entries = os.listdir(parent)  # noqa: PTH208 (names of any bytes, and few of them)
+    except OSError:
+        # not made yet, or not a folder, or the reason why it cannot be written is found next
+        return in_use
+    for entry in entries:
+        match = _STAGING.fullmatch(entry)
+        if match is None or not names.fullmatch(match['name']):
             continue
-        for name in names:
-            match = _STAGING.fullmatch(name)
-            if match is None or match['name'] != final.name:
-                continue
-            try:
-                lock = os.open(parent / name, os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW)
-            except OSError:
-                continue
-            try:
-                fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-                shutil.rmtree(parent / name, ignore_errors=True)
-            except BlockingIOError:
-                raise OutputError(
-                    f'another run writes {final} now; wait until it has ended, or choose another folder with -o'
-                ) from None
-            except OSError:  # some network file systems have no locks, so it may be in use
-                pass
-            finally:
-                os.close(lock)
+        try:
+            lock = os.open(parent / entry, os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW)
+        except OSError:
+            continue
+        try:
+            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            shutil.rmtree(parent / entry, ignore_errors=True)
+        except BlockingIOError:
+            in_use.add(match['name'])
+        except OSError:  # some network file systems have no locks, so it may be in use
+            pass
+        finally:
+            os.close(lock)
+    return in_use
 
 
 def free_name(parent: Path | str, stem: str) -> Path:
-    """Return the first of `stem`, `stem_2`, `stem_3`, … that does not exist in `parent`.
+    """Return the first of `stem`, `stem_2`, `stem_3`, … that does not exist in `parent`, and that no run writes.
+
+    The temporary folders of these names that runs left when they were killed are removed.
 
     Raises
     ------
@@ -206,7 +233,9 @@ def free_name(parent: Path | str, stem: str) -> Path:
     """
     parent = Path(parent)
     with output_errors(parent):
-        taken = set(os.listdir(parent)) if parent.exists() else set()  # noqa: PTH208 (one look, not one per name)
+        taken = remove_abandoned(parent, re.compile(rf'{re.escape(stem)}(_\d+)?'))
+        # a name that is in use above may be complete by now, so that this look comes second
+        taken |= set(os.listdir(parent)) if parent.exists() else set()  # noqa: PTH208 (one look, not one per name)
     names = itertools.chain([stem], (f'{stem}_{n}' for n in itertools.count(2)))
     return parent / next(name for name in names if name not in taken)
 
@@ -216,9 +245,9 @@ def _is_empty_folder(path: Path) -> bool:
     if not os.path.lexists(path):
         return False
     if not path.is_dir():
-        raise OutputError(f'{path} is a file; choose another folder with -o')
+        raise OutputError(f'{path} is a file; choose another folder')
     if any(path.iterdir()):
-        raise OutputError(f'{path} exists and is not empty; choose another folder with -o, or remove it first')
+        raise OutputError(f'{path} exists and is not empty; choose another folder, or remove it first')
     return True
 
 
@@ -249,7 +278,7 @@ def _output_error(path: Path, error: OSError) -> OutputError:
         return OutputError(f'{path}: a part of this path is a file, not a folder; choose another folder')
     if error.errno in (errno.ENOTEMPTY, errno.EEXIST):
         # another run used the name meanwhile
-        return OutputError(f'{path} has been created meanwhile, perhaps by another run; choose another folder')
+        return TakenError(f'{path} has been created meanwhile, perhaps by another run; choose another folder')
     if error.errno in (errno.EACCES, errno.EPERM, errno.EROFS):
         return OutputError(f'{path}: no permission to write there; choose another folder')
     return OutputError(f'{path} cannot be written: {error.strerror or error}')

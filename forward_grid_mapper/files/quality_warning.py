@@ -11,6 +11,7 @@ from ..core.common.parameters import Parameters
 from ..core.common.readings import Readings, drives_of
 from ..core.drive_changes import change_warnings
 from ..core.drive_fit import fit_warnings
+from ..core.learning.agreement import contradiction
 from ..core.learning.consistency import consistency_warnings
 from ..core.learning.input_warnings import input_warnings
 from ..core.maps.map_set import MapSet
@@ -23,6 +24,12 @@ NOT_CONVERGED = 'the search ended at max_iterations before it converged; raise m
 
 ENOUGH = 20
 """Fewest readings for a judgement."""
+
+FEW = 0.05
+"""Random part of the echoes up to which the halves of a drive are not compared, which takes a second."""
+
+APART = 0.035
+"""Least contradiction of the halves of a drive, nats an echo, for a warning; up to 0.03 in sound drives."""
 
 
 def data_warnings(maps: MapSet, source: Mapping[str, Any]) -> list[str]:
@@ -79,6 +86,33 @@ def quality_warning(maps: MapSet) -> str:
     return (
         f'{unexplained} of {count} readings are most likely random measurements: the map does not fit the readings; '
         'are the poses of the sensors, odometry, the field of view and changed parameters right?'
+    )
+
+
+def contradiction_of_halves(maps: MapSet) -> float | None:
+    """Return by how much the halves of a drive contradict each other, nats an echo; None if nearly all echoes fit."""
+    echoes = int(np.count_nonzero(maps.readings.echo))
+    if np.count_nonzero(maps.unexplained) <= FEW * echoes:
+        return None
+    return contradiction(maps.readings, maps.parameters)
+
+
+def halves_warning(apart: float | None, remedy: str) -> str:
+    """Return the warning about halves that contradict each other; '' if they do not.
+
+    Parameters
+    ----------
+    apart : float or None
+        As from `contradiction_of_halves`.
+    remedy : str
+        The option that refines the trajectory; '' if it was given and found none.
+    """
+    if apart is None or apart < APART:
+        return ''
+    corrects = f'{remedy} corrects this' if remedy else 'no better trajectory was found'
+    return (
+        'the two halves of the drive contradict each other, so that walls may be bent or doubled: odometry drifts or '
+        f'jumps ({corrects}), the robot was carried, or many people or things moved'
     )
 
 

@@ -15,14 +15,11 @@ from numpy.typing import NDArray
 from .. import __version__
 from ..core.common.grid import UNKNOWN
 from ..core.common.parameters import TABLE
-from ..core.learning.agreement import contradiction
 from ..core.learning.sensor_health import health_warning, sensor_health
 from ..core.maps.map_set import MapSet
 from .output_folder import output_errors
-from .report_text import MANY, report_text
-
-FEW = 0.05
-"""Random part of the echoes below which a map fits its readings."""
+from .quality_warning import contradiction_of_halves, halves_warning
+from .report_text import report_text
 
 __all__ = ['json_text', 'report_data', 'report_text', 'write_report']
 
@@ -53,10 +50,11 @@ def report_data(maps: MapSet, source: Mapping[str, Any]) -> dict[str, Any]:
     sensors = {name: {**row, 'health': dataclasses.asdict(health[name])} for name, row in _sensors(maps).items()}
     for name, row in (rest.pop('sensors', None) or {}).items():
         sensors[name] = {**sensors.get(name, {}), **row}
+    apart, halves = _halves(maps, source)
     statistics = dict(maps.statistics)
     data = {
         'version': __version__,
-        'warnings': [*(rest.pop('warnings', None) or []), *filter(None, [health_warning(health)])],
+        'warnings': [*(rest.pop('warnings', None) or []), *filter(None, [health_warning(health), halves])],
         'input': rest,
         'counts': counts,
         'sensors': sensors,
@@ -67,7 +65,7 @@ def report_data(maps: MapSet, source: Mapping[str, Any]) -> dict[str, Any]:
             'unexplained': int(np.count_nonzero(maps.unexplained)),
             'log_likelihood': maps.log_likelihood,
             'objective': maps.objective,
-            'contradiction': _contradiction(maps, source),
+            'contradiction': apart,
         },
         'seconds': statistics.pop('seconds', {}),
         'statistics': statistics,
@@ -82,12 +80,17 @@ def report_data(maps: MapSet, source: Mapping[str, Any]) -> dict[str, Any]:
     return made
 
 
-def _contradiction(maps: MapSet, source: Mapping[str, Any]) -> float | None:
-    """Return by how much the halves of a drive disagree, nats an echo; None if that is not the question."""
-    if source.get('drives') or source.get('trajectory'):
-        return None
-    unexplained, echoes = (int(np.count_nonzero(each)) for each in (maps.unexplained, maps.readings.echo))
-    return contradiction(maps.readings, maps.parameters) if FEW * echoes < unexplained <= MANY * echoes else None
+def _halves(maps: MapSet, source: Mapping[str, Any]) -> tuple[float | None, str]:
+    """Return by how much the halves of a drive contradict each other, nats an echo, and the warning, or ''.
+
+    None if there are several drives, or if the trajectory was refined.
+    """
+    trajectory = source.get('trajectory') or {}
+    if source.get('drives') or trajectory.get('refined'):
+        return None, ''
+    apart = contradiction_of_halves(maps)
+    option = '--refine-poses' if source.get('bag') else 'refine_poses'
+    return apart, halves_warning(apart, '' if trajectory else option)
 
 
 def write_report(folder: Path | str, data: dict[str, Any]) -> None:

@@ -21,8 +21,6 @@ _WIDTH = 100
 _SHOWN = 6
 MANY = 0.2
 """Random part of the echoes that is not reached with good poses."""
-_APART = 0.035
-"""Least contradiction of the halves of a drive, nats an echo; up to 0.03 in sound drives in which nobody walks."""
 
 
 def report_text(data: dict[str, Any]) -> str:
@@ -219,11 +217,9 @@ def _result(data: dict[str, Any]) -> Iterator[str]:
         silent = sum(row.get('no_echo') or 0 for row in rows)
         # readings without an echo are hardly ever random measurements, and some sensors have few echoes
         many = unexplained > MANY * ((readings or math.inf) - silent) and not sought
-        apart = (result.get('contradiction') or 0.0) >= _APART
         option = '--refine-poses' if (data.get('input') or {}).get('bag') else 'refine_poses'
         causes = f'odometry that drifts ({option}), wrong poses of sensors, or people who walk by'
-        sign = 'many' if many else 'the two halves of the drive contradict each other' if apart else ''
-        hint = f': {sign}, as with {causes}' if sign else ''
+        hint = f': many, as with {causes}' if many else ''
         yield from _line('Random', f'{counted(unexplained, "reading", ",")} ({share}) {are}{hint}')
     work = [f'{statistics[key]:,} {key}' for key in ('pairs', 'iterations', 'flips', 'shifts') if statistics.get(key)]
     if (converged := statistics.get('converged')) is not None:

@@ -24,7 +24,7 @@ from .output_folder import output_errors
 from .panels import DRIVES, Box, paths_of
 from .picture import NOWHERE, view_of
 
-NAME = 'drive.rrd'
+RECORDING = 'drive.rrd'
 
 MOST_MOMENTS = 40
 """Most standard maps in a file."""

@@ -15,11 +15,11 @@ from ..core.messages.message_types import NANOSECONDS
 from ..core.messages.pose_association import PoseAssociator
 from ..core.messages.sensor_records import has_room
 
-LASTING = 10.0
+JUMP_SPAN = 10.0
 """Seconds for which a jump counts, and between two warnings in the log."""
 
 AGAIN = 3
-"""Jumps within `LASTING` that are a fault; fewer may be a bag that is played again."""
+"""Jumps within `JUMP_SPAN` that are a fault; fewer may be a bag that is played again."""
 
 RARELY = 60.0
 """Seconds before a sensor whose fault has ended and begins again is logged again."""
@@ -60,7 +60,7 @@ class OdometryClock:
         self._jumps.append(now)
         if now < self._next:
             return
-        self._next = now + LASTING
+        self._next = now + JUMP_SPAN
         if back > 0:
             self._warn(
                 f'the clock jumped back ({counted(self._seen[0], "time")} so far): waiting readings were dropped, and '
@@ -80,11 +80,11 @@ class OdometryClock:
     @property
     def jumped(self) -> bool:
         """Whether a jump still counts."""
-        return bool(self._jumps) and time.monotonic() - self._jumps[-1] < LASTING
+        return bool(self._jumps) and time.monotonic() - self._jumps[-1] < JUMP_SPAN
 
     def faults(self) -> list[str]:
         """Return the faults, in words."""
-        if len(self._jumps) < AGAIN or time.monotonic() - self._jumps[0] > LASTING:
+        if len(self._jumps) < AGAIN or time.monotonic() - self._jumps[0] > JUMP_SPAN:
             return []
         return ['the stamps of odometry jump again and again: do two nodes publish odometry, or is a clock set?']
 

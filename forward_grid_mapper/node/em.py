@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from contextlib import suppress
 from dataclasses import dataclass, field
 
@@ -50,10 +50,11 @@ class Run:
     """One run of EM on the readings that `readings` returns, from the map `start` or from the empty one.
 
     `stage` and `progress` are updated during the run. `found` is called with the maps once they are found, in the
-    thread. `shown` is true once an intermediate map was published, `end_requested` if cancel_em was called.
-    `by_itself` is true if the node began the run and no call waits for it; `fresh` returns whether the run uses all
-    readings so far. At its end, `own` are called with the outcome, the work of the node itself; then `waiting`, those
-    who wait for the run. `then` are those who wait for the run after it.
+    thread. `shown` is true once an intermediate map was published, `moved` once its trajectory is the current one,
+    `end_requested` if cancel_em was called. `by_itself` is true if the node began the run and no call waits for it;
+    `fresh` returns whether the run uses all readings so far. `inspect` returns faults of the drive, and is called in
+    the thread. At its end, `own` are called with the outcome, the work of the node itself; then `waiting`, those who
+    wait for the run. `then` are those who wait for the run after it.
     """
 
     mapper: Mapper | RefiningMapper
@@ -67,9 +68,11 @@ class Run:
     progress: Progress | None = None
     cancelled: bool = False
     shown: bool = False
+    moved: bool = False
     end_requested: bool = False
     by_itself: bool = False
     fresh: Callable[[], bool] = lambda: True
+    inspect: Callable[[], Iterable[str]] = tuple
     then: list[Callable[[Outcome], object]] = field(default_factory=list)
     own: list[Callable[[Outcome], object]] = field(default_factory=list)
     waiting: list[Callable[[Outcome], object]] = field(default_factory=list)
@@ -150,14 +153,14 @@ class EmWorker:
         if outcome.maps is not None:
             run.found(outcome.maps)
             run.stage, run.progress = 'judging sensors', None
-            self._judge(outcome, outcome.maps)
+            self._judge(outcome, outcome.maps, run.inspect)
         self._end(run, outcome)
 
-    def _judge(self, outcome: Outcome, maps: MapSet) -> None:
+    def _judge(self, outcome: Outcome, maps: MapSet, inspect: Callable[[], Iterable[str]]) -> None:
         """Add the health of sensors and warnings; the maps are valid without them."""
         try:
             outcome.health = sensor_health(maps)
-            outcome.warnings = [*without_echoes(maps.readings), *input_warnings(maps.readings)]
+            outcome.warnings = [*without_echoes(maps.readings), *input_warnings(maps.readings), *inspect()]
         except Exception as error:
             outcome.warnings = [f'sensors could not be judged: {error!r}']
 

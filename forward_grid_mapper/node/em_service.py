@@ -19,7 +19,7 @@ from ..core.messages.pose_association import PoseAssociator
 from ..core.messages.reading_buffer import bounded
 from ..core.trajectory.recovering import recovered, that_placed
 from ..core.trajectory.windows import Odometry
-from ..files.quality_warning import quality_warning
+from ..files.quality_warning import contradiction_of_halves, halves_warning, quality_warning
 from .background import Inbox, reason
 from .deferred import Reply
 from .em import EmWorker, Outcome, Run, summary
@@ -29,7 +29,7 @@ from .nothing_to_map import nothing_to_map
 from .online import OnlineWorker
 from .refining import Drive, Found, RefiningMapper
 from .sensor_status import SensorWatch
-from .trajectory import Trajectory
+from .trajectory import Trajectory, jump_warnings
 
 LOG_PERIOD = 10.0
 """Seconds between two lines of progress in the log while the trajectory is estimated."""
@@ -47,6 +47,7 @@ class _Checked(NamedTuple):
     readings: int
     extrinsics: Mapping[str, Pose2]
     parameters: Parameters
+    refined: bool
     found: list[str]
 
 
@@ -217,7 +218,10 @@ class EmService:
     def when_there_are_maps(self, done: Callable[[Outcome], object]) -> None:
         """Have `done` called with the latest maps: at once, after the current run, or after a new run."""
         run = self.current
-        if self.maps is not None:
+        if run is not None and run.moved:
+            # the live map is along its trajectory, the latest maps are not
+            run.waiting.append(done)
+        elif self.maps is not None:
             done(Outcome(self.maps, ''))
         elif run is not None and not run.cancelled:
             run.waiting.append(done)
@@ -271,7 +275,7 @@ class EmService:
         def found(maps: MapSet) -> None:
             if isinstance(mapper, RefiningMapper) or moved:
                 # the transform from the map frame changes together with the maps
-                self._inbox.put(lambda: self._show_moved(maps, mapper, taken[0][0], generation))
+                self._inbox.put(lambda: self._show_moved(run, maps, taken[0][0], generation))
             else:
                 self._show(maps, generation)
 
@@ -308,11 +312,16 @@ class EmService:
             _, held, odometry = take_now()
             return Drive(Odometry.of(*odometry), held)
 
+        def inspect() -> list[str]:
+            # with a refined trajectory, its own words say what became of jumps
+            refined = isinstance(mapper, RefiningMapper) and mapper.found and mapper.found.refinement
+            return [] if refined else jump_warnings(Odometry(*taken[0][2]))
+
         mapper, moved = self._trajectory.mapper(parameters, drive, now), self._trajectory.on
         start = self.online.so_far() if self.online and self._trajectory.correction is None else None
         # intermediate maps are shown meanwhile; if the run ends without a map, this one is published again
         before = self._publishers.ml_map
-        run = Run(mapper, parameters, readings, found, start, fresh=fresh)
+        run = Run(mapper, parameters, readings, found, start, fresh=fresh, inspect=inspect)
         self._generation = generation
         self.worker.start(run, finish)
         run.waiting.extend(callers)
@@ -327,10 +336,11 @@ class EmService:
         self._publishers.publish('ml_map', generation, maps.grid, maps.ml)
         self._publishers.publish('uncertainty_map', generation, maps.grid, maps.uncertainty)
 
-    def _show_moved(self, maps: MapSet, mapper: Any, count: int, generation: int) -> None:
+    def _show_moved(self, run: Run, maps: MapSet, count: int, generation: int) -> None:
         """Use the trajectory of a run, and publish its maps."""
         if generation == self._publishers.generation:
-            self._trajectory.adopt(mapper.found if isinstance(mapper, RefiningMapper) else None, count)
+            run.moved = True
+            self._trajectory.adopt(run.mapper.found if isinstance(run.mapper, RefiningMapper) else None, count)
             self._show(maps, generation)
 
     def _needed(self) -> tuple[str, ...]:
@@ -363,18 +373,23 @@ class EmService:
         self._logger.info(f'EM: {self.last_run}')
         # callers of EM are answered before this
         fixed, generation, last = dict(self.extrinsics()), self._publishers.generation, self._checked
-        if last and len(maps.readings) < CHECKED_AGAIN * last.readings and last[1:3] == (fixed, maps.parameters):
+        refined = self._trajectory.correction is not None
+        known = last and last[1:4] == (fixed, maps.parameters, refined)
+        if last and known and len(maps.readings) < CHECKED_AGAIN * last.readings:
             self.wrong_input = [*self.wrong_input, *last.found]
         else:
-            self.worker.worker.put(lambda: self._check_consistency(maps, fixed, generation))
+            self.worker.worker.put(lambda: self._check_consistency(maps, fixed, refined, generation))
 
-    def _check_consistency(self, maps: MapSet, fixed: Mapping[str, Pose2], generation: int) -> None:
-        """Look for sensor poses and clock offsets that contradict the readings; in the worker's thread."""
+    def _check_consistency(self, maps: MapSet, fixed: Mapping[str, Pose2], refined: bool, generation: int) -> None:
+        """Look for sensor poses, clock offsets and odometry that contradict the readings; in the worker's thread."""
         found = consistency_warnings(maps.readings, fixed, maps.parameters)
+        if not refined:
+            remedy = '' if maps.parameters.node.refine_poses else 'refine_poses'
+            found += filter(None, [halves_warning(contradiction_of_halves(maps), remedy)])
 
         def take() -> None:
             if generation == self._publishers.generation and maps is self.maps:
-                self._checked = _Checked(len(maps.readings), fixed, maps.parameters, found)
+                self._checked = _Checked(len(maps.readings), fixed, maps.parameters, refined, found)
                 self.wrong_input = [*self.wrong_input, *found]
                 for warning in found:
                     self._logger.warning(f'EM: {warning}')
@@ -394,8 +409,9 @@ class EmService:
             return
         self._watched = now
         generation = self._generation
-        found = run.mapper.so_far()
-        if found is not None and not run.cancelled:
-            self._logger.info(f'EM: {run}')
+        if run.cancelled:
+            return
+        self._logger.info(f'EM: {run}')
+        if found := run.mapper.so_far():
             run.shown = True
             self._publishers.publish('ml_map', generation, *found)

@@ -83,11 +83,13 @@ class Feed:
         """
         if live is None:
             self.live.touch()
-            return
-        self.live.replace(live)
-        self._live_fed = count
-        self.restart_online()
-        self.feed()
+        else:
+            self.live.replace(live)
+            self._live_fed = count
+            self.restart_online()
+            self.feed()
+        # together with the transform
+        self.live.publish(now=True)
 
     def restart_online(self) -> None:
         """Begin the online map again, from the readings that are kept."""

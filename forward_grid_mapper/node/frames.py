@@ -43,7 +43,7 @@ MOST_MISSING = 1000
 """Most frames that are remembered as missing, or with a pose, so that invented names do not fill the memory."""
 
 
-LASTING = 3.0
+TRANSFORM_PATIENCE = 3.0
 """Seconds without a transform to the map frame before a warning."""
 
 
@@ -225,9 +225,9 @@ class MapFrame:
         return f'TF has no transform {way}: {waiting}; is a localisation node running?'
 
     def fault(self) -> str:
-        """Return the fault that has kept arriving odometry out of the map frame for `LASTING` seconds, or ''."""
+        """Return the fault that has kept arriving odometry out of the map frame for some seconds, or ''."""
         now = time.monotonic()
-        return '' if now - self._lacking < LASTING or now - self._newest > LASTING else self.lack
+        return '' if now - self._lacking < TRANSFORM_PATIENCE or now - self._newest > TRANSFORM_PATIENCE else self.lack
 
     def convert(self, message: OdometryMessage) -> list[OdometryMessage]:
         """Add an odometry message; return those whose pose in the map frame is known now, in order, at most `LOOKUPS`.

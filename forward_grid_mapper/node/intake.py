@@ -22,7 +22,7 @@ from .clocks import Arrivals, OdometryClock, SensorClocks
 from .draining import Draining
 from .frames import MapFrame
 from .heard import Heard
-from .losses import LASTING, Losses
+from .losses import LOSS_WARNING, Losses
 
 QUEUE = 2000
 """Most messages that may wait for the node in the middleware, so that none is lost in a pause of a second."""
@@ -181,7 +181,7 @@ class Intake:
     def _loss_faults(self) -> list[str]:
         now = time.monotonic()
         recent = max(losses.recent for losses in (*self.range_losses, self._odometry_losses))
-        if now > recent + LASTING:
+        if now > recent + LOSS_WARNING:
             return []
         remedy = (
             'this node was stopped or its machine is overloaded: reduce the rate of messages, or the load of the '
@@ -197,7 +197,7 @@ class Intake:
             f'them (estimated): {remedy}'
         )
         if now > self._next_warning and self.lost + self.odometry_lost > self._losses_logged:
-            self._next_warning, self._losses_logged = now + LASTING, self.lost + self.odometry_lost
+            self._next_warning, self._losses_logged = now + LOSS_WARNING, self.lost + self.odometry_lost
             self._node.get_logger().warning(text)
         return [text]
 

@@ -18,7 +18,7 @@ from ..files.journal import Journal
 from ..files.journal_format import stated
 from .diagnostics import status
 
-PERIOD = 0.1
+CHECK_PERIOD = 0.1
 """Seconds between two checks for new readings."""
 
 NOTICE = 60.0
@@ -85,7 +85,7 @@ class JournalKeeper:
         """Write new readings periodically, with a timer of this clock, and before readings are removed."""
         if self._journal is not None:
             self._associator.buffer.before_thinning.append(self.take)
-            self._node.create_timer(PERIOD, self.take, clock=clock)
+            self._node.create_timer(CHECK_PERIOD, self.take, clock=clock)
             self._begun = True
 
     def _restore(self, journal: Journal) -> None:

@@ -37,6 +37,7 @@ class Kernels:
         Without `online`, the kernels of the online map are left out; without `refine`, those of the trajectory.
         """
         self._log = log
+        self._late = threading.Lock()
         self.worker = Worker('kernels', error, lasting=True)
         wanted = {'online map': online, 'trajectory': refine}
         self._steps = {name: step for name, step in warm_up.STEPS.items() if wanted.get(name, True)}
@@ -55,26 +56,33 @@ class Kernels:
             self.worker.put(partial(self._compile, name, ready, begin), lambda why: self._give_up(ready))
 
     def wait(self, name: str, stop: Callable[[], bool] = lambda: False) -> None:
-        """Wait for the kernels of a step; a step that was left out is compiled when it is first used.
+        """Wait for the kernels of a step; a step that was left out is compiled in this thread.
 
         Raises
         ------
         Cancelled
             When `stop` returns true.
         """
-        while name in self._done and not self._done[name].wait(0.1):
+        with self._late:
+            if name not in self._done:
+                begin = time.monotonic()
+                warm_up.STEPS[name]()
+                self._done[name] = threading.Event()
+                self._done[name].set()
+                self._log(f'{name} kernels are ready after {time.monotonic() - begin:.1f} s')
+        while not self._done[name].wait(0.1):
             if stop():
                 raise Cancelled('cancelled while kernels were compiled')
 
     def release(self) -> None:
         """Let all who wait continue if the compilation has not begun, since it will not begin any more."""
         if self not in self.at_work:
-            for done in self._done.values():
+            for done in list(self._done.values()):
                 done.set()
 
     def has(self, name: str) -> bool:
-        """Return whether the kernels of a step are compiled, or the step was left out."""
-        return name not in self._done or self._done[name].is_set()
+        """Return whether the kernels of a step are compiled."""
+        return name in self._done and self._done[name].is_set()
 
     def _compile(self, name: str, ready: Callable[[], None], begin: float) -> None:
         self.stage = name
@@ -88,7 +96,7 @@ class Kernels:
     def _give_up(self, ready: Callable[[], None]) -> None:
         """Let all who wait continue: kernels are compiled when first used, and a failure is reported there."""
         first = not self.has('live map')
-        for done in self._done.values():
+        for done in list(self._done.values()):
             done.set()
         if first:
             ready()

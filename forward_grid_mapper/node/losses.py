@@ -19,7 +19,7 @@ MOST_STREAMS = 256
 NEW_PUBLISHER_GAP = 100
 """Gap, messages, from which an unknown publisher is more likely than a loss, if there is one."""
 
-LASTING = 10.0
+LOSS_WARNING = 10.0
 """Seconds for which the node warns of a loss."""
 
 STEADY = 8
@@ -67,7 +67,7 @@ class Losses:
     def clear(self) -> None:
         """Set the counts to 0."""
         self._reported = self.lost = 0
-        self.recent = -LASTING
+        self.recent = -LOSS_WARNING
 
     def taken(self, info: dict[str, Any], frame: str, stamp: int) -> None:
         """Note a message: rclpy's info, frame_id, and stamp in nanoseconds."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import traceback
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 from rosgraph_msgs.msg import Clock
@@ -25,9 +26,10 @@ except ImportError:  # without lifecycle_msgs it is a node like any other, and s
 class ManagedNode(Base):
     """Maps transitions to four methods, and destroys at cleanup what was created since the configuration.
 
-    A subclass has `configure`, `activate`, `deactivate` and `close`. If one raises, the transition fails, and the error
-    is logged; the node keeps its state. What a failed `configure` has created is destroyed here; a failed `activate`
-    destroys it itself.
+    A subclass has `configure`, `activate`, `deactivate` and `close`. If one of the first three raises, the transition
+    fails, and the error is logged; the node keeps its state. What a failed `configure` has created is destroyed here; a
+    failed `activate` destroys it itself. If `close` raises, the error is logged, and the transition succeeds, since
+    nothing is left that the node could return to.
     """
 
     def __init__(self, name: str, **options: Any) -> None:
@@ -145,13 +147,18 @@ class ManagedNode(Base):
         return answer
 
     def _undo(self) -> None:
-        """End the work, and destroy the entities created for it."""
+        """End the work, and destroy the entities created for it; what fails is logged, and the rest is done."""
+        self._attempt(self.close)
+        while self._created:
+            destroy, entity = self._created.pop()
+            self._attempt(partial(destroy, entity))
+
+    def _attempt(self, work: Callable[[], object]) -> None:
+        """Do a part of ending the work; if it fails, log it, so that the other parts are done."""
         try:
-            self.close()
-        finally:
-            while self._created:
-                destroy, entity = self._created.pop()
-                destroy(entity)
+            work()
+        except Exception:
+            self.get_logger().error(f'a part of the node did not end in order: {traceback.format_exc()}')
 
     def destroy_node(self) -> None:
         """Destroy the node, and its state machine, which would keep the node in the middleware."""

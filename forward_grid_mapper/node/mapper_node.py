@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import gc
 from collections.abc import Callable
-from contextlib import ExitStack
 from functools import partial
 from typing import Any
 
@@ -22,6 +21,7 @@ from ..core.messages.message_types import NANOSECONDS
 from ..core.messages.pose_association import PoseAssociator
 from ..core.messages.rep117 import rejection_warnings, sensor_rejections
 from ..files.output_folder import unwritable
+from ..files.parameter_file import NODE_NAME
 from . import ros_parameters
 from .background import Inbox, Worker
 from .complaints import of_ros
@@ -40,7 +40,6 @@ from .reporter import Reporter
 from .saver import Account, Saver
 from .trajectory import Trajectory
 
-NAME = 'forward_grid_mapper'
 FEED_PERIOD = 0.02
 """Seconds between two transfers of readings to the maps."""
 
@@ -70,7 +69,13 @@ class MapperNode(ManagedNode):
         ParameterError
             If a parameter given at start is not valid.
         """
-        super().__init__(NAME, automatically_declare_parameters_from_overrides=True, **options)
+        # undeclared ones for poses of further sensors; the validator refuses all others
+        super().__init__(
+            NODE_NAME,
+            automatically_declare_parameters_from_overrides=True,
+            allow_undeclared_parameters=True,
+            **options,
+        )
         self.parameters, _, warnings = ros_parameters.declare(self)
         for warning in warnings:
             self.get_logger().warning(warning)
@@ -214,28 +219,25 @@ class MapperNode(ManagedNode):
         self.get_logger().info('inactive: nothing is received; maps and services stay')
 
     def close(self) -> None:
-        """End the work in the background, also of a configuration that failed."""
+        """End the work in the background, also of a configuration that failed; failures are logged."""
         self._started = self.mapping = False
         calls, ends = self._calls, self._ends
         self._calls, self._ends = [], []
         self._when_ready.clear()
-        with ExitStack() as work:
-            # calls that wait will get no result
-            for service in calls:
-                work.callback(service.end, 'the node is being cleaned up')
-            # the last one first; compilation is finished in any case, for the next configuration
-            for end in ends:
-                work.callback(end)
+        # the last one first; compilation is finished in any case, for the next configuration
+        for end in reversed(ends):
+            self._attempt(end)
+        # calls that wait will get no result
+        for service in calls:
+            self._attempt(partial(service.end, 'the node is being cleaned up'))
 
     def _undo(self) -> None:
-        try:
-            super()._undo()
-        finally:
-            # `Kernels` froze the existing objects, and the collector ignores frozen ones
-            for name in vars(self).keys() - self._own - {'_own'}:
-                delattr(self, name)
-            gc.unfreeze()
-            gc.collect()
+        super()._undo()
+        for name in vars(self).keys() - self._own - {'_own'}:
+            delattr(self, name)
+        # `Kernels` froze the existing objects, and the collector ignores frozen ones
+        gc.unfreeze()
+        gc.collect()
 
     # the start
 
@@ -291,7 +293,9 @@ class MapperNode(ManagedNode):
     # parameters
 
     def _validator(self) -> Callable[[Any], Any]:
-        return ros_parameters.validator(lambda: self.parameters, self._accept, lambda: self._started)
+        return ros_parameters.validator(
+            lambda: self.parameters, self._accept, lambda: self._started, self.has_parameter
+        )
 
     def _accept(self, parameters: Parameters) -> None:
         refine = self.parameters.node.refine_poses, parameters.node.refine_poses

@@ -16,12 +16,13 @@ from typing import Any
 import numpy as np
 from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped, TransformStamped
 from nav_msgs.msg import Path
-from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.qos import QoSProfile
 
 from ..core.common.readings import Floats
 from ..core.messages.message_types import NANOSECONDS, Pose2, stamp_of
 from ..core.messages.stamp_order import JUMP
 from ..core.trajectory.windows import Odometry
+from .map_publishers import LATCHED
 
 PERIOD = 0.05
 """Seconds between two transforms."""
@@ -45,7 +46,6 @@ STEP = 0.1
 """Shortest distance between two of them, metres."""
 
 TRANSFORMS = QoSProfile(depth=100)
-LATCHED = QoSProfile(depth=1, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 
 
 def transform_sender(node: Any) -> Callable[[TransformStamped], object] | None:

@@ -90,7 +90,7 @@ class RefiningMapper:
         self._to_refine, self._before = refine, before
         self._stop, self._kept = np.zeros(1, np.uint8), ''
         self._mapper, self._refiner = Mapper(parameters), Refiner(parameters)
-        self._cancelled = False
+        self._cancelled, self._moves = False, before is not None
 
     def cancel(self) -> None:
         """Make `run` raise `Cancelled` soon; may be called from any thread."""
@@ -102,8 +102,11 @@ class RefiningMapper:
         self._mapper.cancel()
 
     def so_far(self) -> tuple[Grid, NDArray[np.int8]] | None:
-        """Return the result of `Mapper.so_far`."""
-        return self._mapper.so_far()
+        """Return the result of `Mapper.so_far`; None along another trajectory than the current one.
+
+        Its coordinates are those of a transform that is published only after the run.
+        """
+        return None if self._moves else self._mapper.so_far()
 
     def run(
         self,
@@ -124,6 +127,7 @@ class RefiningMapper:
             readings = refinement.readings
             if refinement.accepted:
                 correction, start = Correction(drive.odometry, refinement.trajectory), None
+                self._moves = True
         live = None
         if correction is not None or self._before is not None:
             watch('live map along the trajectory', None)

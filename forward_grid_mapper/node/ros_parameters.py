@@ -19,13 +19,16 @@ from ..core.common.parameters import TABLE, Parameters
 from ..core.messages.message_types import Pose2
 from ..core.messages.mounts import mount_from
 
-ROS_OWN = ('use_sim_time', 'start_type_description_service', 'qos_overrides')
+ROS_SWITCHES = ('use_sim_time', 'start_type_description_service')
+ROS_OWN = (*ROS_SWITCHES, 'qos_overrides')
 NAMES = {row.name for row in TABLE}
 CONFIGURED = {row.name for row in TABLE if row.read_only}
 """Parameters that `configure` reads, like the poses of sensors."""
 
 AT_START = ('autostart',)
 """Those of them that only the start of the process reads."""
+
+_POSE = re.compile(r'sensors\.(?P<frame>.+)\.pose', re.DOTALL)
 
 
 def descriptor(row: Parameter) -> ParameterDescriptor:
@@ -59,6 +62,10 @@ def declare(node: Node) -> tuple[Parameters, dict[str, Pose2], list[str]]:
         If a value has the wrong type or is out of range.
     """
     given = node.get_parameters_by_prefix('')
+    for name in ROS_SWITCHES:
+        # rclpy only logs it, and a node without the clock of a simulation would wait for other stamps
+        if name in given and not isinstance(given[name].value, bool):
+            raise ParameterError(f'{name}: {given[name].value!r} is not true or false; admitted: true | false')
     former = {new: old for old, new in RENAMED.items()}
     values = {}
     for row in TABLE:
@@ -89,6 +96,7 @@ def validator(
     current: Callable[[], Parameters],
     accept: Callable[[Parameters], None],
     configured: Callable[[], bool] = lambda: True,
+    declared: Callable[[str], bool] = lambda name: True,
 ) -> Callable[[Any], Any]:
     """Return a callback that checks parameters before they are set.
 
@@ -100,14 +108,20 @@ def validator(
         Receives the new ones if all are valid.
     configured : callable
         Returns whether the node is configured, so that it has read the parameters in `CONFIGURED`.
+    declared : callable
+        Returns whether the node has a parameter. The only others that are accepted are poses of sensors, and those of
+        ROS, which rclpy declares by setting them.
     """
 
     def check(changes: list[RosParameter]) -> SetParametersResult:
         try:
             for change in changes:
-                if configured() and (change.name in CONFIGURED or change.name.startswith('sensors.')):
+                name = change.name
+                if not (declared(name) or _is_known(name)):
+                    raise ParameterError(_unknown(name))
+                if configured() and (name in CONFIGURED or name.startswith('sensors.')):
                     raise ParameterError(
-                        f'{change.name} is read-only while the node is configured: restart the node with it, or set it '
+                        f'{name} is read-only while the node is configured: restart the node with it, or set it '
                         'between cleanup and configure'
                     )
             _extrinsics({change.name: change for change in changes})
@@ -134,26 +148,37 @@ def with_points(changes: list[RosParameter]) -> list[RosParameter]:
     ]
 
 
+def _is_pose(name: str) -> bool:
+    return _POSE.fullmatch(name) is not None
+
+
+def _is_known(name: str) -> bool:
+    """Return whether a parameter is one of this node, or of ROS, whether or not it is declared."""
+    return name in NAMES or _is_pose(name) or name.partition('.')[0] in ROS_OWN
+
+
 def _extrinsics(given: dict[str, RosParameter]) -> dict[str, Pose2]:
-    extrinsics = {}
-    for name, parameter in given.items():
-        if name.startswith('sensors.') and name.endswith('.pose'):
-            extrinsics[name[len('sensors.') : -len('.pose')]] = mount_from(name, parameter.value)
-    return extrinsics
+    return {
+        found['frame']: mount_from(name, parameter.value)
+        for name, parameter in given.items()
+        if (found := _POSE.fullmatch(name))
+    }
 
 
 def _unknown_names(given: dict[str, RosParameter]) -> list[str]:
-    warnings = []
-    for name in given:
-        pose = name.startswith('sensors.') and name.endswith('.pose')
-        if name in NAMES or pose or name.partition('.')[0] in ROS_OWN:
-            continue
-        if name in DEPRECATED or name in RENAMED:
-            warnings.append(deprecation(name))
-            continue
-        near = difflib.get_close_matches(name, NAMES, n=1)
-        hint = f'; did you mean {near[0]}?' if near else ''
-        if re.match(r'sensors?\.', name):
-            hint = '; set poses of sensors as sensors.<frame_id>.pose: [x, y, yaw]'
-        warnings.append(f'parameter {name} is not known to this node and is ignored{hint}')
-    return warnings
+    return [
+        deprecation(name) if name in DEPRECATED or name in RENAMED else _unknown(name, ' and is ignored')
+        for name in given
+        if not _is_known(name)
+    ]
+
+
+def _unknown(name: str, outcome: str = '') -> str:
+    """Return that the node has no such parameter, with a remedy if one is known."""
+    near = [RENAMED[name]] if name in RENAMED else difflib.get_close_matches(name, NAMES, n=1)
+    hint = f'; did you mean {near[0]}?' if near else ''
+    if name in DEPRECATED:
+        hint = f': {DEPRECATED[name]}'
+    if re.match(r'sensors?\.', name):
+        hint = '; set poses of sensors as sensors.<frame_id>.pose: [x, y, yaw]'
+    return f'parameter {name} is not known to this node{outcome}{hint}'

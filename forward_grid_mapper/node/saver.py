@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import re
 import time
 from collections.abc import Callable
+from contextlib import suppress
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -12,7 +15,7 @@ from numpy.typing import NDArray
 from ..core.common.errors import MapperError
 from ..core.common.words import counted
 from ..core.maps.map_set import MapSet
-from ..files.output_folder import expanded, free_name
+from ..files.output_folder import TakenError, expanded, free_name, remove_abandoned
 from ..files.quality_warning import thinned
 from ..files.results import write_results
 from ..files.trajectory_text import trajectory_data, trajectory_files
@@ -25,6 +28,13 @@ from .refining import Found
 
 USES = {'ml_map.yaml': ' for Nav2', 'report.html': ' for a browser', 'report.txt': ''}
 """Files that the answer names, and what they are for."""
+
+
+NAMES = re.compile(r'maps_\d{4}-\d\d-\d\d_\d\d-\d\d-\d\d(_\d+)?')
+"""Names of the folders that save_maps makes."""
+
+MOST_TAKEN = 10
+"""Most names that are tried; more nodes than these do not save at once."""
 
 
 class Account(NamedTuple):
@@ -40,6 +50,27 @@ class Account(NamedTuple):
     odometry: tuple[NDArray[np.int64], NDArray[np.float64]]
     folder: str
     title: str
+
+
+def in_a_free_folder(parent: Path, write: Callable[[Path], dict[str, Any]]) -> tuple[Path, dict[str, Any]]:
+    """Write into a folder with the time as its name; return it and the result of `write`.
+
+    Another node may save into the same parent in the same second, so the next free name is tried if one is taken.
+    Temporary folders of nodes that were killed are removed.
+
+    Raises
+    ------
+    OutputError
+        If the folder cannot be written.
+    """
+    remove_abandoned(parent, NAMES)
+    stem = f'maps_{time.strftime("%Y-%m-%d_%H-%M-%S")}'
+    folder = free_name(parent, stem)
+    for _ in range(MOST_TAKEN):
+        with suppress(TakenError):
+            return folder, write(folder)
+        folder = free_name(parent, stem)
+    return folder, write(folder)
 
 
 class Saver:
@@ -87,7 +118,6 @@ class Saver:
         if note := thinned(len(maps.readings), explained):
             warnings.append(note)
         parent = expanded(account.folder).resolve()
-        folder = free_name(parent, f'maps_{time.strftime("%Y-%m-%d_%H-%M-%S")}')
         path_xy = np.array(account.path, np.float64).reshape(-1, 2)
         options: dict[str, Any] = {}
         if found is not None and found.refinement is not None:
@@ -99,7 +129,11 @@ class Saver:
             texts = trajectory_files(found.refinement, found.correction.odometry)
             options = {'extras': texts, 'odometry_xy': path_xy}
             path_xy = found.correction.path_of(*account.odometry)
-        report = write_results(folder, maps, account.source, path_xy, account.title, **options)
+
+        def write(folder: Path) -> dict[str, Any]:
+            return write_results(folder, maps, account.source, path_xy, account.title, **options)
+
+        folder, report = in_a_free_folder(parent, write)
         for warning in report['warnings']:
             self._logger.warning(f'save_maps: {warning}')
         names = {path.name for path in folder.iterdir()}

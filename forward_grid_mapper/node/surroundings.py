@@ -10,8 +10,8 @@ from rclpy.qos import DurabilityPolicy, QoSCompatibility, QoSProfile, Reliabilit
 
 from .diagnostics import listed
 
-PERIOD = 3.0
-"""Seconds between two checks."""
+GRAPH_PERIOD = 3.0
+"""Seconds between two checks of the graph of nodes and topics."""
 
 KINDS = {'Range': 'sensor_msgs/msg/Range', 'Odometry': 'nav_msgs/msg/Odometry'}
 PARAMETER = {'Range': 'range_topics, or remap sonar', 'Odometry': 'odom_topic, or remap odom'}
@@ -54,7 +54,7 @@ class Surroundings:
         """Return the faults, in words."""
         now = time.monotonic()
         if now >= self._next:
-            self._next = now + PERIOD
+            self._next = now + GRAPH_PERIOD
             self._faults = [*self._incompatible(), *self._transforms_lost(), *self._no_clock(), *self._same_names()]
             self._faults += filter(None, [self._contested()])
             for fault in self._faults:
@@ -118,7 +118,7 @@ class Surroundings:
     def _no_clock(self) -> list[str]:
         """Return the fault of missing simulated time, once there was time to discover publishers."""
         clock = self._node.get_clock()
-        if not clock.ros_time_is_active or clock.now().nanoseconds or time.monotonic() < self._begin + PERIOD:
+        if not clock.ros_time_is_active or clock.now().nanoseconds or time.monotonic() < self._begin + GRAPH_PERIOD:
             return []
         topic = self._node.resolve_topic_name('/clock')
         who = 'publishes' if not self._node.count_publishers(topic) else 'has published on'

@@ -22,7 +22,7 @@ from ..core.maps.log_odds_map import LogOddsMap
 from ..core.messages.message_types import Pose2
 from ..core.messages.pose_association import PoseAssociator
 from ..core.trajectory.correction import Correction
-from ..core.trajectory.jumps import jumps, may_jump
+from ..core.trajectory.jumps import MOST_JUMPS, jumps, may_jump
 from ..core.trajectory.refinable import SHORTEST
 from ..core.trajectory.windows import STILL, Odometry
 from ..files.report_text import UNTESTED
@@ -73,6 +73,21 @@ class _Jump(NamedTuple):
             f'odometry jumped by {self.far:.1f} m: the pose of the robot on the map is unknown until run_em has found '
             'it, and new readings are mapped with wrong poses; if the robot was carried away (kidnapped), call reset'
         )
+
+
+def jump_warnings(odometry: Odometry) -> list[str]:
+    """Return a warning if odometry jumps, for maps along it; not if it seems to consist of jumps."""
+    at = jumps(odometry)
+    if not 0 < len(at) <= MOST_JUMPS:
+        return []
+    first = int(at[0])
+    driven = float(np.hypot(*np.diff(odometry.pose[:first, :2], axis=0).T).sum())
+    far = math.dist(odometry.pose[first - 1, :2].tolist(), odometry.pose[first, :2].tolist())
+    often = 'once,' if len(at) == 1 else f'{len(at)} times, first'
+    return [
+        f'odometry jumps {often} by {far:.1f} m after {driven:.0f} m of driving: readings after the jump are mapped in '
+        'a wrong place; set refine_poses, which corrects this from the readings, or call reset after a jump'
+    ]
 
 
 class Trajectory:
@@ -332,7 +347,7 @@ class Trajectory:
         """Update the distance driven, and do the work that is due."""
         before, self._at = self._at or (stamp, pose), (stamp, pose)
         self._add_distance(before, pose)
-        if self.following is not None and self._parameters.node.refine_poses:
+        if self.following is not None:
             self.following.offer(pose, lambda: (self._associator.buffer.snapshot(), self._associator.record.snapshot()))
         if self.driven - self._shown_at >= PATH_EVERY and not self._showing:
             self._show_path()

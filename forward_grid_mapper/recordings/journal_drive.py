@@ -136,6 +136,11 @@ def _warnings(path: Path, contents: Contents, associator: PoseAssociator, parame
     warnings = []
     if contents.harm:
         warnings.append(f'{path.name}: {contents.harm}')
+    for earlier, its in contents.earlier_files(path):
+        if its.harm:
+            warnings.append(f'{earlier.name}, which {path.name} continues: {its.harm}')
+    if contents.earlier is not None and contents.earlier.unread:
+        warnings.append(f'{path.name} continues {contents.continues}: {contents.earlier.unread}')
     if contents.note:
         warnings.append(f'{path.name}: {contents.note}; a node that starts with this journal continues in a new file')
     for reason, count in associator.rejected.items():

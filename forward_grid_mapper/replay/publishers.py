@@ -12,7 +12,7 @@ from ..core.messages.message_types import NANOSECONDS
 from .ros_messages import filled, message_class
 from .stop_signal import StopSignal
 
-NODE = 'replay_bag'
+NODE_NAME = 'replay_bag'
 SETTLING = 0.5
 """Seconds from the discovery of subscribers to the first message: they must discover us too, for best effort."""
 
@@ -63,8 +63,8 @@ class Publishers:
             ) from error
         self._ros = rclpy
         try:
-            rclpy.init(args=[NODE, *self._ros_arguments], signal_handler_options=SignalHandlerOptions.NO)
-            self._node = rclpy.create_node(NODE, start_parameter_services=False)
+            rclpy.init(args=[NODE_NAME, *self._ros_arguments], signal_handler_options=SignalHandlerOptions.NO)
+            self._node = rclpy.create_node(NODE_NAME, start_parameter_services=False)
         except Exception as error:  # rclpy's errors have no common base
             self.__exit__(None, None, None)
             raise MapperError(f'ROS 2 does not start: {error}') from error

@@ -11,6 +11,9 @@ from typing import Any
 
 SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
+AT_ONCE = 3600.0
+"""Longest wait of one call of the system, seconds; it accepts only some centuries."""
+
 
 class StopSignal:
     """Handles the signals in a `with` block; used in the main thread.
@@ -56,7 +59,7 @@ class StopSignal:
             left = deadline - time.monotonic()
             if left <= 0:
                 break
-            if select.select([self._pipe[0]], [], [], left)[0]:
+            if select.select([self._pipe[0]], [], [], min(left, AT_ONCE))[0]:
                 # signals of other kinds wake it too; the handler of ours has run by now
                 os.read(self._pipe[0], 512)
         return self._requested

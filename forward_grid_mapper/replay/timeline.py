@@ -69,4 +69,5 @@ class Timeline:
         if self._latest is None:
             return 0
         wall, begin = self._anchor
-        return min(self._latest, begin + int((self._now() - wall) * self._rate * NANOSECONDS))
+        # at a high rate the product may be infinite
+        return begin + int(min((self._now() - wall) * self._rate * NANOSECONDS, self._latest - begin))

@@ -475,8 +475,17 @@ def test_file_size_limit_is_handled_as_a_full_disk(tmp_path: Path) -> None:
 
 def test_journal_folder_that_is_a_file_is_rejected(tmp_path: Path) -> None:
     (tmp_path / 'file').write_text('')
-    with pytest.raises(OutputError, match='file'):
+    with pytest.raises(OutputError, match=r'/file is a file, but a journal is a folder$'):
         Journal(tmp_path / 'file', print)
+    with pytest.raises(OutputError, match='a part of this path is a file'):
+        Journal(tmp_path / 'file' / 'journal', print)
+    (tmp_path / 'drive_0001.journal').write_text('')
+    with pytest.raises(OutputError, match=rf'drive_0001\.journal is a file, .*: give {tmp_path}$'):
+        Journal(tmp_path / 'drive_0001.journal', print)
+    (tmp_path / 'broken').symlink_to('nowhere')
+    with pytest.raises(OutputError, match='is a folder'):
+        Journal(tmp_path / 'broken', print)
+    assert not (tmp_path / 'lock').exists()
 
 
 # at the start of a node

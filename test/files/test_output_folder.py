@@ -59,7 +59,7 @@ def test_second_run_is_refused_at_once(tmp_path: Path, exists: bool) -> None:
         maps.mkdir()
     with output_folder(maps) as folder:
         (folder / 'a.txt').write_text('a')
-        with pytest.raises(OutputError, match=r'another run writes .*maps now; wait until .* another folder with -o'):
+        with pytest.raises(OutputError, match=r'another run writes .*maps now; wait until .* another folder'):
             fill(maps)
         fill(tmp_path / 'others')
     assert names_in(maps) == ['a.txt'] and names_in(tmp_path) == ['maps', 'others']
@@ -92,7 +92,7 @@ def test_file_system_without_locks_is_written(tmp_path: Path, monkeypatch: pytes
 
 def test_folder_that_is_not_empty_is_rejected(tmp_path: Path) -> None:
     (tmp_path / 'mine.txt').write_text('mine')
-    with pytest.raises(OutputError, match='choose another folder with -o'):
+    with pytest.raises(OutputError, match='choose another folder'):
         fill(tmp_path)
     assert names_in(tmp_path) == ['mine.txt']
 
@@ -175,6 +175,9 @@ def test_free_name_never_overwrites(tmp_path: Path) -> None:
         path.mkdir()
     (tmp_path / 'maps_4').symlink_to('nowhere')
     assert free_name(tmp_path, 'maps').name == 'maps_5'
+    with output_folder(tmp_path / 'maps_5'):
+        assert free_name(tmp_path, 'maps').name == 'maps_6'
+    assert free_name(tmp_path, 'maps').name == 'maps_6', 'that run has ended'
 
 
 def test_free_name_below_a_file(tmp_path: Path) -> None:

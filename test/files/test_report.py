@@ -13,7 +13,7 @@ from made_maps import made_maps
 
 from forward_grid_mapper.core.common.errors import OutputError
 from forward_grid_mapper.core.common.parameters import Parameters
-from forward_grid_mapper.files import report
+from forward_grid_mapper.files import quality_warning
 from forward_grid_mapper.files.report import report_data, write_report
 from forward_grid_mapper.files.report_text import report_text
 
@@ -134,25 +134,28 @@ def test_many_random_readings_give_a_hint_to_refine_poses() -> None:
     assert 'many, as' in report_text(report_data(some, {}))
 
 
-def test_halves_that_contradict_each_other_give_a_hint_to_refine_poses() -> None:
-    data = report_data(made_maps(readings=200), {'bag': 'monday'})
-    hint = 'the two halves of the drive contradict each other, as with odometry that drifts (--refine-poses), wrong'
-    for value, shown in ((0.06, True), (0.02, False), (None, False)):
-        data['result']['contradiction'] = value
-        assert (hint in ' '.join(report_text(data).split())) == shown
-
-
 @pytest.mark.parametrize(
-    ('part', 'source', 'asked'),
-    [(20, {}, True), (5, {}, False), (80, {}, False), (20, {'trajectory': {}, 'drives': [{'bag': 'a'}]}, False)],
+    ('part', 'apart', 'source', 'shown'),
+    [
+        (20, 0.06, {'bag': 'monday'}, 'jumps (--refine-poses corrects this), the robot was carried'),
+        (80, 0.06, {}, 'jumps (refine_poses corrects this), the robot was carried'),
+        (20, 0.06, {'trajectory': {'refined': False}}, 'jumps (no better trajectory was found), the robot was carried'),
+        (20, 0.02, {}, ''),
+        (5, 0.06, {}, None),
+        (20, 0.06, {'trajectory': {'refined': True}}, None),
+        (20, 0.06, {'drives': [{'bag': 'a'}]}, None),
+    ],
 )
-def test_halves_are_compared_only_if_that_may_be_the_cause(
-    monkeypatch: pytest.MonkeyPatch, part: int, source: dict[str, Any], asked: bool
+def test_halves_that_contradict_each_other_give_a_warning(
+    monkeypatch: pytest.MonkeyPatch, part: int, apart: float, source: dict[str, Any], shown: str | None
 ) -> None:
-    monkeypatch.setattr(report, 'contradiction', lambda readings, parameters: 0.5)
+    """They are compared only if many echoes do not fit, and the trajectory was not refined."""
+    monkeypatch.setattr(quality_warning, 'contradiction', lambda readings, parameters: apart)
     maps = made_maps(readings=200)
-    some = dataclasses.replace(maps, unexplained=np.arange(200) < part)
-    assert report_data(some, source)['result']['contradiction'] == (0.5 if asked else None)
+    data = report_data(dataclasses.replace(maps, unexplained=np.arange(200) < part), source)
+    assert data['result']['contradiction'] == (None if shown is None else apart)
+    warned = [text for text in data['warnings'] if text.startswith('the two halves of the drive contradict each other')]
+    assert len(warned) == bool(shown) and all(shown in text for text in warned)
 
 
 def test_report_without_source() -> None:

@@ -129,6 +129,7 @@ class EmRobot:
         self.kernels: Any = SimpleNamespace(has=self.compiled.__contains__, wait=self._wait)
         self.trajectory: Any = PlainTrajectory(self)
         self.warnings, self.contradictions = list[str](), list[str]()
+        self.halves: float | None = None
         monkeypatch.setattr(em, 'map_grid', lambda readings, parameters: GRID)
         monkeypatch.setattr(em, 'sensor_health', lambda maps: {'sonar': 'health'})
         monkeypatch.setattr(em, 'input_warnings', lambda readings: list(self.warnings))
@@ -138,6 +139,7 @@ class EmRobot:
         )
         self.checked: list[tuple[int, Any]] = []
         monkeypatch.setattr(em_service, 'consistency_warnings', self._check)
+        monkeypatch.setattr(em_service, 'contradiction_of_halves', lambda maps: self.halves)
         self.em = EmService(
             lambda: self.parameters,
             self.associator,

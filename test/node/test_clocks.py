@@ -14,7 +14,7 @@ from stand_ins import Taking
 
 from forward_grid_mapper.core.messages.extrinsics import LATE
 from forward_grid_mapper.node import clocks
-from forward_grid_mapper.node.clocks import AGAIN, LASTING, RARELY, Arrivals
+from forward_grid_mapper.node.clocks import AGAIN, JUMP_SPAN, RARELY, Arrivals
 from forward_grid_mapper.node.frames import MapFrame, Transforms
 
 
@@ -41,18 +41,18 @@ def test_two_odometry_sources_with_different_clocks_give_rare_warnings(clock: An
     (fault,) = faults(robot)
     assert 'do two nodes publish odometry, or is a clock set?' in fault
     assert len(robot.node.warned) == 1, 'in 5 s'
-    clock.now += LASTING
+    clock.now += JUMP_SPAN
     robot.odometry(2020.0)
     robot.odometry(2005.0)
     assert len(robot.node.warned) == 2 and '(100 times so far)' in robot.node.warned[1]
-    clock.now += LASTING
+    clock.now += JUMP_SPAN
     assert faults(robot) == []
 
 
 def test_restarted_bag_is_no_fault(clock: Any) -> None:
     robot = taking()
     for _ in range(AGAIN + 2):
-        clock.now += 0.6 * LASTING
+        clock.now += 0.6 * JUMP_SPAN
         for k in range(10):
             robot.odometry(100.0 + k)
     assert faults(robot) == []
@@ -60,7 +60,7 @@ def test_restarted_bag_is_no_fault(clock: Any) -> None:
     robot.associator.clear()
     robot.intake.forget()
     warned = len(robot.node.warned)
-    clock.now += LASTING
+    clock.now += JUMP_SPAN
     robot.odometry(110.0)
     assert len(robot.node.warned) == warned, 'counts that a reset sets to 0 are no jumps'
 

@@ -36,6 +36,8 @@ def rejected(domain: int, *arguments: str, **changes: str) -> tuple[int, str]:
         (['--ros-args', '--parms-file', 'x.yaml'], 2, 'did you mean --params-file?'),
         (['--ros-args', '-r', '__node:=1st'], 1, '-r __node:=1st is not a valid rule'),
         (['--ros-args', '-p', 'range_topics:=[]'], 1, 'a parameter has no value, or an empty list'),
+        (['--ros-args', '-p', 'range_topics:=5'], 1, 'range_topics: 5 is not a list of text'),
+        (['--ros-args', '-p', 'use_sim_time:=5'], 1, 'use_sim_time: 5 is not true or false'),
         (['--ros-args', '-p', 'odom_topic:="a b"'], 1, "odom_topic: 'a b' is not a valid topic name"),
         (['--ros-args', '-r', '~/ml_map:=/map', '-r', '~/live_map:=/map'], 1, '/map can have only one map'),
         (['--ros-args', '-p', 'journal:=~nobody_of_this_name/x'], 1, 'there is no user nobody_of_this_name'),

@@ -17,7 +17,7 @@ from em_robot import BEFORE, GRID, PROGRESS, SO_FAR, EmRobot
 
 from forward_grid_mapper.core.common.errors import InputError
 from forward_grid_mapper.core.common.parameters import Parameters
-from forward_grid_mapper.core.messages.message_types import Pose2
+from forward_grid_mapper.core.messages.message_types import OdometryMessage, Pose2
 from forward_grid_mapper.node import em_service
 
 
@@ -406,7 +406,7 @@ def test_contradictions_are_checked_after_the_response_and_logged(robot: EmRobot
     # nothing is logged about deleted maps, or about maps that have been replaced
     robot.node.warned.clear()
     for forget in ('maps', 'generation'):
-        robot.em._check_consistency(robot.em.maps, {}, 3)  # type: ignore[arg-type]
+        robot.em._check_consistency(robot.em.maps, {}, False, 3)  # type: ignore[arg-type]
         if forget == 'maps':
             kept, robot.em.maps = robot.em.maps, None
         else:
@@ -415,6 +415,30 @@ def test_contradictions_are_checked_after_the_response_and_logged(robot: EmRobot
         robot.em.maps = kept
         robot.publishers.generation = 3
     assert robot.node.warned == [] and len(robot.em.wrong_input) == 3
+
+
+def test_halves_that_contradict_each_other_give_a_warning(robot: EmRobot) -> None:
+    robot.halves = 0.06
+    for values, corrected, words in (
+        ({}, None, 'jumps (refine_poses corrects this)'),
+        ({'refine_poses': True}, None, 'jumps (no better trajectory was found)'),
+        ({'refine_poses': True}, object(), ''),
+    ):
+        robot.parameters, robot.trajectory.correction = Parameters.from_flat(values), corrected
+        robot.run_em()
+        robot.settle()
+        assert len(robot.em.wrong_input) == bool(words) and all(words in text for text in robot.em.wrong_input)
+
+
+def test_jump_of_odometry_is_named_in_the_response(robot: EmRobot) -> None:
+    for k in range(40):
+        # 5 cm each, and 4.2 m to the left after 19 of them
+        robot.associator.add_odometry(
+            OdometryMessage(k * 50_000_000, 'odom', 'base', Pose2(0.05 * k, 4.2 * (k > 19), 0.0))
+        )
+    answer = robot.run_em()
+    robot.settle()
+    assert 'WARNING: odometry jumps once, by 4.2 m after 1 m of driving' in answer.sent[0][1]
 
 
 def test_consistency_is_checked_again_when_the_readings_have_doubled(robot: EmRobot) -> None:

@@ -20,7 +20,7 @@ from stand_ins import Taking
 from forward_grid_mapper.node import intake as module
 from forward_grid_mapper.node.frames import MapFrame, Transforms
 from forward_grid_mapper.node.intake import AT_ONCE, QUEUE
-from forward_grid_mapper.node.losses import LASTING
+from forward_grid_mapper.node.losses import LOSS_WARNING
 
 
 def test_messages_before_the_begin_wait_and_are_processed_in_order() -> None:
@@ -234,12 +234,12 @@ def test_recent_losses_give_a_warning_and_rare_log_lines(
     assert robot.node.warned == [fault]
     assert '2 Range and 5 odometry messages were lost' in robot.intake.loss_note()[0]
     # further losses are in the diagnostics, and in the log only after some time
-    now += LASTING / 2
+    now += LOSS_WARNING / 2
     robot.range(100.2, number=6)
     assert '3 Range' in robot.intake.faults()[0] and len(robot.node.warned) == 1
-    now += LASTING / 2 + 0.1
+    now += LOSS_WARNING / 2 + 0.1
     assert '3 Range' in robot.intake.faults()[0] and len(robot.node.warned) == 2
-    now += LASTING
+    now += LOSS_WARNING
     assert robot.intake.faults() == [] and robot.intake.loss_note()
     assert len(robot.node.warned) == 2
 

@@ -22,7 +22,7 @@ from forward_grid_mapper.core.messages.pose_association import PoseAssociator
 from forward_grid_mapper.files.journal_format import Contents
 from forward_grid_mapper.files.journal_reader import read
 from forward_grid_mapper.node import journal_keeper
-from forward_grid_mapper.node.journal_keeper import NOTICE, PERIOD, JournalKeeper
+from forward_grid_mapper.node.journal_keeper import CHECK_PERIOD, NOTICE, JournalKeeper
 
 OK, WARN = b'\x00', b'\x01'
 
@@ -96,7 +96,7 @@ def test_without_a_folder_no_journal_is_kept() -> None:
 def test_new_readings_are_written_and_restored(tmp_path: Path) -> None:
     kept = KeptJournal(tmp_path, sigma=0.07).start()
     ((period, take, clock),) = kept.node.timers
-    assert (period, clock) == (PERIOD, 'the clock')
+    assert (period, clock) == (CHECK_PERIOD, 'the clock')
     for first in (0, 5):
         kept.drive(first, 5)
         kept.associator.extend_path((float(first), 1.0))

@@ -78,14 +78,18 @@ def test_kernels_of_the_live_map_are_compiled_first(compiling: Compiling) -> Non
     assert (kernels.stage, kernels in Kernels.at_work, gc.isenabled()) == ('', False, True)
 
 
-def test_unneeded_steps_are_skipped_and_not_waited_for(compiling: Compiling) -> None:
+def test_unneeded_steps_are_compiled_once_they_are_waited_for(compiling: Compiling) -> None:
     for event in compiling.go_on.values():
         event.set()
     kernels = compiling.begin(online=False, refine=False)
-    kernels.wait('online map')
-    kernels.wait('trajectory')
     ended(kernels)
     assert compiling.done == [name for name in warm_up.STEPS if name not in ('online map', 'trajectory')]
+    assert not kernels.has('trajectory')
+    for _ in range(2):
+        kernels.wait('trajectory')
+        assert kernels.has('trajectory')
+    assert compiling.done.count('trajectory') == 1 and 'online map' not in compiling.done
+    assert any(line.startswith('trajectory kernels are ready') for line in compiling.lines)
 
 
 @pytest.mark.parametrize('failing', ['live map', 'EM'])

@@ -11,7 +11,9 @@ import threading
 import weakref
 from collections.abc import Callable, Iterator
 from contextlib import suppress
+from functools import partial
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -318,20 +320,31 @@ def test_read_only_parameters_can_be_set_between_cleanup_and_configure(inside: C
     robot = inside()
     node = robot.node
     node.start()
-    changes = {'resolution': 0.2, 'range_topics': ['left', 'right'], 'sensors.sonar.pose': [0.5, 0.0, 0.0]}
+    changes = {
+        'resolution': 0.2,
+        'range_topics': ['left', 'right'],
+        'sensors.sonar.pose': [0.5, 0.0, 0.0],
+        # no such parameter was given at the start
+        'sensors.further.pose': [0.7, 0.0, 0.0],
+    }
     for name, value in changes.items():
         (result,) = node.set_parameters([Parameter(name, value=value)])
         assert not result.successful and f'{name} is read-only while the node is configured' in result.reason
     assert node.trigger_deactivate() == node.trigger_cleanup() == TransitionCallbackReturn.SUCCESS
     robot.set(**changes)
-    (result,) = node.set_parameters([Parameter('sensors.sonar.pose', value=[0.5, 0.0])])
-    assert not result.successful, 'that is no pose'
+    for name in ('sensors.sonar.pose', 'sensors.third.pose'):
+        (result,) = node.set_parameters([Parameter(name, value=[0.5, 0.0])])
+        assert not result.successful, 'that is no pose'
+    assert not node.has_parameter('sensors.third.pose')
+    (result,) = node.set_parameters([Parameter('p_hitt', value=0.5)])
+    assert not result.successful and 'did you mean p_hit?' in result.reason
     assert node.trigger_configure() == node.trigger_activate() == TransitionCallbackReturn.SUCCESS
     assert sorted(topic for topic in node.intake.subscriptions if topic != '/odom') == ['/left', '/right']
     robot.until(lambda: node.mapping)
     robot.odometry(100.0)
     robot.range(100.0)
-    assert node.associator.readings.x == pytest.approx([0.5])
+    robot.range(100.0, frame='further')
+    assert node.associator.readings.x == pytest.approx([0.5, 0.7])
     assert node.live.grid.resolution == 0.2
 
 
@@ -438,6 +451,48 @@ def test_configuration_rejected_by_rcl_leaves_no_parts(
         assert {*threading.enumerate()} <= others
         assert not node._created
     assert result == TransitionCallbackReturn.SUCCESS and most > 15
+
+
+def test_clean_up_in_which_parts_fail_ends_the_others(
+    inside: Callable[..., Inside], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The state must not say that the node can be activated again, since it has no parts any more."""
+
+    def broken(*arguments: Any) -> Any:
+        raise RuntimeError('no space left')
+
+    robot = inside()
+    node = robot.node
+    logged: list[str] = []
+    logger = SimpleNamespace(error=logged.append, info=print, warning=print)
+    monkeypatch.setattr(mapper_node.MapperNode, 'get_logger', lambda self: logger)
+    for _ in range(2):
+        robot.start()
+        ended: list[int] = []
+        node._ends[:0] = [partial(ended.append, 1), broken]
+        node._ends += [broken, partial(ended.append, 2)]
+        node._calls.insert(0, SimpleNamespace(end=broken))
+        node._created.append((broken, None))
+        assert node.trigger_deactivate() == node.trigger_cleanup() == TransitionCallbackReturn.SUCCESS
+        assert node._state_machine.current_state[1] == 'unconfigured'
+        assert ended == [2, 1] and not node._created and not hasattr(node, 'intake')
+        assert len(logged) == 4 and all('no space left' in text for text in logged)
+        logged.clear()
+
+
+def test_failed_configuration_in_which_parts_fail_can_be_repeated(
+    inside: Callable[..., Inside], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def broken(*arguments: Any) -> Any:
+        raise RuntimeError('no space left')
+
+    node = inside().node
+    with monkeypatch.context() as patched:
+        patched.setattr(mapper_node.JournalKeeper, 'open', broken)
+        patched.setattr(mapper_node.JournalKeeper, 'close', broken)
+        assert node.trigger_configure() == TransitionCallbackReturn.FAILURE
+    assert node._state_machine.current_state[1] == 'unconfigured'
+    assert node.trigger_configure() == TransitionCallbackReturn.SUCCESS
 
 
 def test_clean_up_while_the_journal_is_read_leaves_no_parts(inside: Callable[..., Inside]) -> None:

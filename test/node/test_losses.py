@@ -8,7 +8,7 @@ import time
 import pytest
 
 from forward_grid_mapper.core.messages.message_types import NANOSECONDS
-from forward_grid_mapper.node.losses import LASTING, MOST_STREAMS, NEW_PUBLISHER_GAP, STEADY, Losses
+from forward_grid_mapper.node.losses import LOSS_WARNING, MOST_STREAMS, NEW_PUBLISHER_GAP, STEADY, Losses
 
 MILLISECOND = 1_000_000
 
@@ -86,12 +86,12 @@ def test_losses_from_middleware_and_gaps_are_counted_once() -> None:
     assert losses.lost == 8
     losses.clear()
     assert losses.lost == 0
-    assert losses.recent + LASTING <= 0
+    assert losses.recent + LOSS_WARNING <= 0
     losses.reported(LostMessages(0))
-    assert losses.recent + LASTING <= 0, 'nothing was lost'
+    assert losses.recent + LOSS_WARNING <= 0, 'nothing was lost'
     losses.reported(LostMessages(2))
     assert losses.lost == 2
-    assert time.monotonic() - LASTING < losses.recent <= time.monotonic()
+    assert time.monotonic() - LOSS_WARNING < losses.recent <= time.monotonic()
 
 
 def at_steps(losses: Losses, *steps: float, frame: str = 'sonar') -> list[int]:

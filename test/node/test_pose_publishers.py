@@ -166,7 +166,7 @@ def test_transform_is_repeated_without_new_odometry(
 def test_other_publisher_of_the_transform_is_a_fault(
     inside: Callable[..., Inside], tf2_ros: type[Broadcaster], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(surroundings, 'PERIOD', 0.0)
+    monkeypatch.setattr(surroundings, 'GRAPH_PERIOD', 0.0)
     robot, _ = mapping(inside, monkeypatch)
     fault = 'another node publishes the transform from map to odom as well'
     robot.drive(0, 40)
@@ -192,7 +192,7 @@ def test_other_publisher_of_the_transform_is_a_fault(
 def test_other_publisher_is_no_fault_without_refinement(
     inside: Callable[..., Inside], tf2_ros: type[Broadcaster], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(surroundings, 'PERIOD', 0.0)
+    monkeypatch.setattr(surroundings, 'GRAPH_PERIOD', 0.0)
     robot = inside().start()
     robot.drive(0, 40)
     tf2_ros.newest = TransformStamped()

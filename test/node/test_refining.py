@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import threading
 from collections.abc import Callable
 from dataclasses import replace
@@ -71,6 +72,78 @@ def test_readings_received_during_refinement_are_not_lost(
     robot.until(lambda: answer.sent)
     assert answer.sent[0][0]
     assert_live(robot, bent)
+
+
+@pytest.mark.parametrize('at_run_time', [False, True])
+def test_maps_along_another_trajectory_are_not_shown_before_it_is_current(
+    inside: Callable[..., Inside], quick: Any, monkeypatch: pytest.MonkeyPatch, at_run_time: bool
+) -> None:
+    """Their coordinates are those of a transform that is published only after the run."""
+    robot = inside(publish_rate=50.0, refine_poses=not at_run_time).start()
+    node, shown = robot.node, list[tuple[bool, bool]]()
+    if at_run_time:
+        robot.set(refine_poses=True)
+    watch, publish = node.em.worker._watch, node.maps.publish
+
+    def always(run: Any) -> None:
+        run.begin, node.em._watched = 0.0, 0.0
+        watch(run)
+
+    def recorded(name: str, *rest: Any) -> None:
+        if name == 'ml_map':
+            shown.append((node.em.current.progress is None, node.trajectory.correction is None))
+        publish(name, *rest)
+
+    monkeypatch.setattr(node.em.worker, '_watch', always)
+    monkeypatch.setattr(node.maps, 'publish', recorded)
+    refined(robot)
+    # only the final map, after the correction is in force
+    assert len(shown) == 1 and not shown[0][1]
+    quick.accepts = False
+    shown.clear()
+    robot.set(refine_poses=False)
+    assert robot.call(node.em.run_em)[0]
+    assert len(shown) == 1 and shown[0][1]
+    # along odometry, maps are shown while they are made
+    shown.clear()
+    assert robot.call(node.em.run_em)[0]
+    assert len(shown) > 1
+
+
+def test_maps_are_saved_along_the_trajectory_of_the_live_map(
+    inside: Callable[..., Inside], quick: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    robot, bent = refined(inside().start())
+    node, go_on = robot.node, threading.Event()
+    judge = node.em.worker._judge
+
+    def held(*given: Any) -> None:
+        assert go_on.wait(60.0)
+        judge(*given)
+
+    monkeypatch.setattr(node.em.worker, '_judge', held)
+    robot.set(refine_poses=True)
+    answer = robot.begin(node.em.run_em)
+    robot.until(lambda: node.trajectory.correction is not None)
+    assert_live(robot, bent)
+    saved = robot.begin(node.saver.save_maps)
+    robot.spin(0.2)
+    assert not saved.sent
+    go_on.set()
+    robot.until(lambda: answer.sent and saved.sent)
+    folder = Path(saved.sent[0][1].split(', ')[0]).parent
+    data = json.loads((folder / 'report.json').read_text())
+    assert data['input']['map_frame'] == 'map' and data['input']['trajectory']['refined']
+    assert (folder / 'trajectory.tum').exists()
+
+
+def test_live_map_is_published_with_the_transform(inside: Callable[..., Inside], quick: Any) -> None:
+    robot = inside(refine_poses=True, publish_rate=0.01).start()
+    robot.drive(0, 200)
+    robot.until(lambda: not robot.node.intake.busy)
+    assert robot.call(robot.node.em.run_em)[0]
+    robot.until(lambda: robot.node.maps.latest.get('live_map'), 30.0)
+    assert robot.node.maps.latest['live_map'].header.frame_id == 'map'
 
 
 def test_rejected_trajectory_keeps_the_poses_of_odometry(inside: Callable[..., Inside], quick: Any) -> None:

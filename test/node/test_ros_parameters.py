@@ -129,6 +129,14 @@ def test_value_out_of_range_at_start_is_rejected() -> None:
         declare(Declaring(p_hit=2.0))
 
 
+@pytest.mark.parametrize('name', ['use_sim_time', 'start_type_description_service'])
+@pytest.mark.parametrize('value', [5, 'yes', 1.0, [True]])
+def test_switch_of_ros_that_is_not_true_or_false_is_rejected(name: str, value: Any) -> None:
+    with pytest.raises(ParameterError, match=f'{name}: .* is not true or false'):
+        declare(Declaring(**{name: value}))
+    declare(Declaring(**{name: False}))
+
+
 def test_values_set_at_run_time_are_checked_together() -> None:
     now = Parameters()
     accepted: list[Parameters] = []
@@ -166,6 +174,26 @@ def test_read_only_parameters_can_be_set_before_configure() -> None:
         result = check([RosParameter(name, value=value)])
         assert not result.successful and name in result.reason
     assert len(accepted) == 1
+
+
+def test_new_poses_can_be_set_before_configure_and_unknown_names_never() -> None:
+    accepted: list[Parameters] = []
+    for configured in (False, True):
+        check = validator(Parameters, accepted.append, lambda configured=configured: configured, {'p_hit'}.__contains__)
+        for name, why in (
+            ('p_hitt', 'parameter p_hitt is not known to this node; did you mean p_hit?'),
+            ('cut', 'parameter cut is not known to this node: no longer a parameter'),
+            ('max_sweeps', 'parameter max_sweeps is not known to this node; did you mean max_iterations?'),
+            ('sensors.front.poze', 'set poses of sensors as sensors.<frame_id>.pose: [x, y, yaw]'),
+            ('sensors.pose', 'set poses of sensors as sensors.<frame_id>.pose: [x, y, yaw]'),
+            ('', 'is not known'),
+        ):
+            result = check([RosParameter('p_hit', value=0.7), RosParameter(name, value=[0.0, 0.0, 0.0])])
+            assert not result.successful and why in result.reason
+        assert check([RosParameter('qos_overrides./tf.depth', value=5)]).successful
+        pose = check([RosParameter('sensors.front.pose', value=[0.0, 0.0, 0.0])])
+        assert pose.successful is not configured
+    assert 'set it between cleanup and configure' in pose.reason
 
 
 def test_whole_number_is_converted_to_a_double_parameter() -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import threading
 import time
 from collections.abc import Callable
+from contextlib import ExitStack
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -18,6 +19,7 @@ from stand_ins import PlainNode
 
 from forward_grid_mapper.core.common.errors import OutputError
 from forward_grid_mapper.core.common.grid import Grid
+from forward_grid_mapper.files.output_folder import TakenError, output_folder
 from forward_grid_mapper.node import saver
 from forward_grid_mapper.node.em import Outcome
 from forward_grid_mapper.node.live import LiveSnapshot
@@ -115,6 +117,62 @@ def test_each_call_uses_a_free_name(node: Node) -> None:
     for _ in range(3):
         assert node.save().answer()[0]
     assert len({folder for folder, *_ in node.written}) == 3
+
+
+@pytest.mark.parametrize('how', ['it is being written', 'at the same moment', 'it was made meanwhile'])
+def test_nodes_that_save_in_the_same_second_use_different_folders(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, how: str
+) -> None:
+    monkeypatch.setattr(time, 'strftime', lambda format: '2026-01-02_03-04-05')
+    tried: list[str] = []
+
+    def save(path: Path) -> dict[str, Any]:
+        tried.append(path.name)
+        if how == 'at the same moment' and len(tried) == 1:
+            other.enter_context(output_folder(path))
+        with output_folder(path) as folder:
+            (folder / 'mine').touch()
+            if how == 'it was made meanwhile' and len(tried) == 1:
+                (path / 'of another node').mkdir(parents=True)
+        return {}
+
+    with ExitStack() as other:
+        if how == 'it is being written':
+            other.enter_context(output_folder(tmp_path / 'maps_2026-01-02_03-04-05'))
+        found, _ = saver.in_a_free_folder(tmp_path, save)
+        assert found == tmp_path / 'maps_2026-01-02_03-04-05_2'
+        assert [path.name for path in found.iterdir()] == ['mine']
+    assert len(tried) == (1 if how == 'it is being written' else 2)
+    assert sorted(path.name for path in tmp_path.iterdir()) == [found.name[:-2], found.name]
+
+
+def test_names_that_are_always_taken_end_with_an_error(tmp_path: Path) -> None:
+    def save(path: Path) -> dict[str, Any]:
+        raise TakenError('taken')
+
+    with pytest.raises(OutputError, match='taken'):
+        saver.in_a_free_folder(tmp_path, save)
+
+
+def test_rests_of_killed_nodes_are_removed_and_nothing_else(node: Node) -> None:
+    node.folder.mkdir()
+    rests = ['.maps_2026-01-02_03-04-05.0123abcd.partial', '.maps_2026-01-02_03-04-05_2.0123abcd.partial']
+    kept = [
+        *('maps_2026-01-02_03-04-05', '.maps_2026-01-02_03-04-05', '.maps_mine.0123abcd.partial'),
+        *('.maps_2026-01-02_03-04-05.0123abcd', 'maps_2026-01-02_03-04-05.0123abcd.partial', '.other.0123abcd.partial'),
+    ]
+    for name in rests + kept:
+        (node.folder / name).mkdir()
+        (node.folder / name / 'maps.npz').touch()
+    (node.folder / '.maps_2026-01-02_03-04-06.0123abcd.partial').touch()
+    link = node.folder / '.maps_2026-01-02_03-04-07.0123abcd.partial'
+    link.symlink_to(node.folder / kept[0])
+    with output_folder(node.folder / 'maps_2026-01-02_03-04-08') as writing:
+        assert node.save().answer()[0]
+        ((saved, *_),) = node.written
+        left = {path.name for path in node.folder.iterdir()}
+    assert left == {*kept, writing.name, link.name, '.maps_2026-01-02_03-04-06.0123abcd.partial', saved.name}
+    assert all((node.folder / name / 'maps.npz').exists() for name in kept)
 
 
 def test_path_of_a_robot_without_poses_is_empty(node: Node) -> None:

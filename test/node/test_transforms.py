@@ -88,8 +88,8 @@ def tf2(monkeypatch: pytest.MonkeyPatch) -> None:
     modules['tf2_msgs.msg'].TFMessage = MultiDOFJointState  # type: ignore[attr-defined]
     for name, module in modules.items():
         monkeypatch.setitem(sys.modules, name, module)
-    monkeypatch.setattr(surroundings, 'PERIOD', 0.05)
-    monkeypatch.setattr(frames, 'LASTING', 0.2)
+    monkeypatch.setattr(surroundings, 'GRAPH_PERIOD', 0.05)
+    monkeypatch.setattr(frames, 'TRANSFORM_PATIENCE', 0.2)
     monkeypatch.setattr(frames, 'PATIENCE', 0.0)
 
 

@@ -14,7 +14,7 @@ import pytest
 
 sys.path.insert(0, str(Path(__file__).parents[1] / 'files'))
 
-from journal_samples import Previous
+from journal_samples import FRAMES, Previous
 
 from forward_grid_mapper.commands.learn import main as learn
 from forward_grid_mapper.commands.process_bag import main as process_bag
@@ -56,6 +56,47 @@ def test_after_a_reset_the_earlier_file_is_named(tmp_path: Path, capsys: pytest.
     said = capsys.readouterr().err
     assert 'drive_0002.journal contains no reading; earlier files can be given by name: ' in said
     assert f'{folder / "drive_0001.journal"}' in said
+
+
+def test_file_that_the_newest_one_continues_is_read_as_well(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder = tmp_path / 'j'
+    folder.mkdir()
+    old = folder / 'drive_0001.journal'
+    old.write_bytes(b'')
+    made = Journal(folder, print)
+    assert not list(made.restore())
+    number = np.arange(40, 340)
+    made.put(
+        Readings.from_columns(
+            names=('left',),
+            x=0.01 * number,
+            y=0.0,
+            yaw=0.0,
+            z=np.ones(300),
+            z_max=9.0,
+            half_angle=0.2,
+            stamp=number * 10**8,
+        ),
+        FRAMES,
+    )
+    made.close()
+    capsys.readouterr()
+    for content, expected, said in (
+        (b'', 300, f'drive_0002.journal continues drive_0001.journal: {old} is not a journal'),
+        (Previous.file(40), 340, ''),
+        (Previous.file(40)[:-3], 330, 'drive_0001.journal, which drive_0002.journal continues: its last'),
+        (None, 300, 'drive_0001.journal, which drive_0002.journal continues: it was removed'),
+    ):
+        old.unlink()
+        if content is not None:
+            old.write_bytes(content)
+        output = tmp_path / f'out {expected} {said[:20]}'
+        assert process_bag([str(folder), '-q', '-o', str(output), '--set', 'max_iterations=1']) == 0
+        assert f'{expected} received, {expected} accepted' in (output / 'report.txt').read_text()
+        warnings = capsys.readouterr().err
+        assert said in warnings and ('continues' in warnings) == bool(said)
 
 
 def test_options_without_effect_on_a_journal_are_reported(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import math
 import signal
 import sys
 import threading
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, ClassVar
@@ -18,6 +21,7 @@ from forward_grid_mapper.commands import replay_bag
 from forward_grid_mapper.core.common.errors import MapperError, ParameterError
 from forward_grid_mapper.core.messages.message_types import OdometryMessage, Pose2, RangeMessage
 from forward_grid_mapper.replay import publishers as publishing
+from forward_grid_mapper.replay import stop_signal
 from forward_grid_mapper.replay.publishers import renamed
 from forward_grid_mapper.replay.stop_signal import StopSignal
 
@@ -123,6 +127,46 @@ def test_signal_ends_a_wait_at_once_and_a_second_one_has_no_effect(number: signa
         for each, handler in before.items():
             signal.signal(each, handler)
         signal.signal(signal.SIGINT, signal.default_int_handler)
+
+
+@contextmanager
+def terminated_soon() -> Iterator[None]:
+    """Send SIGTERM to this process in a moment; the block must handle it."""
+    before = {number: signal.getsignal(number) for number in stop_signal.SIGNALS}
+    timer = threading.Timer(0.3, signal.raise_signal, [signal.SIGTERM])
+    timer.start()
+    try:
+        yield
+    finally:
+        timer.cancel()
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
+@pytest.mark.parametrize('seconds', [1e10, 1e300, math.inf])
+def test_signal_ends_a_wait_of_any_length(seconds: float) -> None:
+    with terminated_soon(), StopSignal() as stop:
+        assert stop.wait(seconds)
+
+
+def test_long_wait_ends_at_its_time(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(stop_signal, 'AT_ONCE', 0.01)
+    begin = time.monotonic()
+    with StopSignal() as stop:
+        assert not stop.wait(0.1)
+    assert time.monotonic() - begin >= 0.1
+
+
+@pytest.mark.parametrize('rate', ['1e-20', '5e-324'])
+def test_replay_at_a_very_low_rate_waits_until_it_is_stopped(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, rate: str
+) -> None:
+    monkeypatch.setattr(replay_bag, 'Publishers', Publishers)
+    monkeypatch.setattr(replay_bag, 'message_class', lambda msgtype: object)
+    bag = str(with_joint(tmp_path))
+    with terminated_soon():
+        assert replay_bag.main([bag, '--wait', '0', '-q', '--rate', rate]) == 0
+    assert [topic for topic, _ in Publishers.published] == ['/odom', '/tf']
 
 
 def test_replay_under_nohup_survives_its_terminal() -> None:

@@ -43,6 +43,14 @@ def test_bag_time_advances_up_to_the_next_message(wall: Wall) -> None:
     assert timeline.time() == START + 3 * SECOND
 
 
+def test_highest_rate_is_no_fault(wall: Wall) -> None:
+    timeline = Timeline(1e308, wall)
+    timeline.due('odom', START)
+    timeline.due('odom', START + SECOND)
+    wall.seconds += 0.1
+    assert timeline.time() == START + SECOND
+
+
 def test_latency_of_a_topic_delays_no_messages(wall: Wall) -> None:
     timeline = Timeline(1.0, wall)
     timeline.due('odom', START)

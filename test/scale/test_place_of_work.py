@@ -6,7 +6,9 @@ from pathlib import Path
 
 import pytest
 
-from forward_grid_mapper.commands.many_workers import beside
+from forward_grid_mapper.commands import process_bag
+from forward_grid_mapper.commands.many_workers import beside, check_apart
+from forward_grid_mapper.scale import extra
 
 
 @pytest.mark.parametrize(
@@ -27,3 +29,51 @@ def test_work_folder_is_beside_the_results(
     monkeypatch.chdir(tmp_path / 'here')
     assert beside(Path(output)) == (tmp_path / work.format(tmp_path.name)).resolve()
     assert Path(output).resolve() not in beside(Path(output)).resolve().parents
+
+
+@pytest.mark.parametrize(
+    ('output', 'work'),
+    [
+        ('maps', 'maps'),
+        ('maps', 'maps/'),
+        ('maps', 'maps/work'),
+        ('maps', 'other/../maps/a/b'),
+        ('maps', '../here/maps/work'),
+        ('.', 'work'),
+        ('..', 'work'),
+        ('link', 'real/work'),
+        ('real', 'link/work'),
+        ('real/maps', 'link'),
+        ('work/maps', 'work'),
+        ('maps/', '.'),
+        # the results are outside the folder that the link names
+        ('link/../maps', 'maps/work'),
+    ],
+)
+def test_work_and_results_inside_each_other_are_refused_before_any_work(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], output: str, work: str
+) -> None:
+    """The results could not be written at the end, or would be deleted with the work."""
+    monkeypatch.setattr(extra, 'need', lambda: None)
+    here = tmp_path / 'here'
+    for folder in ('real', 'other'):
+        (here / folder).mkdir(parents=True)
+    (here / 'link').symlink_to('real')
+    monkeypatch.chdir(here)
+    before = sorted(tmp_path.rglob('*'))
+    assert process_bag.main(['no_bag', '--workers', '1', '-o', output, '--work', work]) == 1
+    error = capsys.readouterr().err
+    assert '--work ' in error and 'choose one outside the results, or leave out --work' in error
+    assert sorted(tmp_path.rglob('*')) == before
+
+
+@pytest.mark.parametrize(
+    ('output', 'work'), [('maps', 'maps.work'), ('maps', 'map'), ('a/maps', 'a/work'), ('link/maps', 'work')]
+)
+def test_work_next_to_the_results_is_accepted(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, output: str, work: str
+) -> None:
+    (tmp_path / 'real').mkdir()
+    (tmp_path / 'link').symlink_to('real')
+    monkeypatch.chdir(tmp_path)
+    check_apart(Path(output), Path(work))

@@ -60,8 +60,8 @@ REASONS = {
     'time_jump': 'the clock jumped back while the reading waited for its pose',
     'too_many_waiting': 'too many readings waited for odometry at once',
     'too_far_away': 'the map would have more than max_cells cells; are pose and max_range right?',
-    'far_from_map': 'the reading is farther than max_jump from the mapped area; if the pose is right, begin a new map (in '
-    'the node: call reset)',
+    'far_from_map': 'the reading is farther than max_jump from the mapped area; if the pose is right, begin a new map '
+    '(in the node: call reset)',
     'large_cone': 'the cone has millions of cells; are range, field of view and resolution right?',
     'paused': 'the mapper was paused',
 }

@@ -36,6 +36,8 @@ class Attempt(NamedTuple):
         Its nodes.
     sure : bool
         Whether it is so sure that no other method needs to be tried.
+    by_votes : bool
+        Whether it is accepted by the votes of walls alone: readings are not clearly predicted better.
     before_matching : bool
         Whether it was refused before anything was matched, because nothing showed that odometry is wrong.
     unproven : Attempt or None
@@ -45,6 +47,7 @@ class Attempt(NamedTuple):
     refinement: Refinement
     nodes: Floats
     sure: bool = False
+    by_votes: bool = False
     before_matching: bool = False
     unproven: Attempt | None = None
 

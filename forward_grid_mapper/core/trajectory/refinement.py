@@ -27,12 +27,13 @@ from .after_jumps import Part, begins_of, parts_at, with_doubtful
 from .any_angle import match_drive
 from .attempt import LEAST_MOVED, Attempt, Drive, gain_words, refined
 from .certainty import LARGEST_SIGMA, yaw_errors
-from .holding_out import LEAST_SIGMAS, has_revisits, held_out
+from .holding_out import LEAST_SIGMAS, Gain, has_revisits, held_out
 from .judging import gain_at_revisits, gain_of_objective
 from .jumps import MOST_JUMPS, jumps, without_outliers
 from .local_map import for_matching
 from .odometry_model import CALIBRATION
 from .outcome import Refinement, differences, joined_parts, replaced, with_all_poses, with_outliers
+from .passes import BLOCK
 from .refinable import unfit, without_times
 from .relocating import LEAST_RECOGNISED
 from .right_angles import at_right_angles
@@ -123,7 +124,10 @@ class Refiner:
         by_walls = at_right_angles(drive, noise, least_moved, self._start_stage)
         if by_walls.sure:
             return by_walls.refinement
-        return self._at_any_angle(drive, by_walls, least_moved)
+        found = self._at_any_angle(drive, by_walls, least_moved)
+        if found is by_walls.refinement and by_walls.by_votes:
+            return _unless_unsupported(drive, by_walls)
+        return found
 
     def _at_any_angle(self, drive: Drive, by_walls: Attempt, least_moved: float) -> Refinement:
         """Return the trajectory by matching alone, if it is better than that by walls at right angles."""
@@ -221,6 +225,27 @@ def too_sparse_words(apart: float) -> str:
 def _without_better(found: Refinement, why: str = NOR_MATCHES) -> Refinement:
     """Return the result by walls, with the reason why matching alone gave no better one if it is not accepted."""
     return found if found.accepted else replace(found, reason=found.reason + why)
+
+
+def _unless_unsupported(drive: Drive, by_walls: Attempt) -> Refinement:
+    """Return a trajectory that only doubtful walls support, or odometry if J does not support it as well."""
+    readings, odometry, windows, scans = drive
+    try:
+        better = gain_of_objective(scans, windows.node, by_walls.nodes)
+    except InputError:
+        # the map along this trajectory is too large
+        better = Gain(0.0, np.inf)
+    if better.sigmas >= LEAST_SIGMAS:
+        return by_walls.refinement
+    by = (
+        f' ({better.mean:.1f} ± {better.error:.1f} nats for each {BLOCK * TRAVEL:g} m)' if better.error < np.inf else ''
+    )
+    reason = (
+        'what walls say is doubtful, and along that trajectory the readings as a whole are not clearly more likely '
+        f'than with odometry{by}'
+    )
+    found = by_walls.refinement
+    return Refinement(False, reason + NOR_MATCHES, readings, odometry, found.calibration, gain=found.gain)
 
 
 def _recognition_words(part: float) -> str:

@@ -87,11 +87,15 @@ class _AlongWalls(NamedTuple):
 
 
 class _Verdict(NamedTuple):
-    """Whether a trajectory is accepted in place of odometry, its gain over odometry, and the reason in words."""
+    """Whether a trajectory is accepted in place of odometry, its gain over odometry, and the reason in words.
+
+    `by_votes` is as in `Attempt`.
+    """
 
     accepted: bool
     gain: Gain
     words: str
+    by_votes: bool = False
 
 
 class _Candidate(NamedTuple):
@@ -231,7 +235,7 @@ def _at_revisits(drive: Drive, walls: _AlongWalls, nodes: Floats) -> _Verdict:
     if better.sigmas < LEAST_SIGMAS_WITH_WALLS:
         return _Verdict(False, better, words)
     likelier = f'the readings are more likely by {walls.vote_gain:.0f} nats than with odometry'
-    return _Verdict(True, better, f'with walls at right angles, {likelier}; {words}')
+    return _Verdict(True, better, f'with walls at right angles, {likelier}; {words}', by_votes=True)
 
 
 def _accepted(drive: Drive, best: _Candidate, verdict: _Verdict, noise: float, least_moved: float) -> Attempt:
@@ -255,7 +259,7 @@ def _accepted(drive: Drive, best: _Candidate, verdict: _Verdict, noise: float, l
         noise=noise,
     )
     sure = recognised_part(scans, best.nodes, best.loops) >= LEAST_RECOGNISED and turns_supported(scans, best.nodes)
-    return Attempt(outcome, best.nodes, sure)
+    return Attempt(outcome, best.nodes, sure, verdict.by_votes)
 
 
 def _by_name(calibration: Floats) -> dict[str, float]:

@@ -172,6 +172,31 @@ def test_walls_are_tried_again_once_matching_shows_that_odometry_is_wrong(
     assert found.reason.startswith('walls; scan matching alone shows' if by_walls else 'walls are not assumed')
 
 
+@pytest.mark.parametrize(('by_votes', 'gain', 'accepted'), [(True, 0.2, False), (True, 0.3, True), (False, 0.2, True)])
+def test_doubtful_walls_need_a_larger_objective(bent, monkeypatch, by_votes: bool, gain: float, accepted: bool) -> None:
+    (readings, odometry), asked = bent, []
+
+    def at_right_angles(drive: Drive, *rest) -> Attempt:
+        outcome = Refinement(True, 'walls', readings, odometry, {'scale': 0.01}, gain=0.4)
+        return Attempt(outcome, drive.windows.node * (1.1, 1.0, 1.0), by_votes=by_votes)
+
+    def gain_of_objective(scans: Scans, before, after) -> Gain:
+        asked.append((before, after))
+        return Gain(gain, 0.1)
+
+    monkeypatch.setattr(refinement, 'at_right_angles', at_right_angles)
+    monkeypatch.setattr(refinement, 'match_drive', no_matches)
+    monkeypatch.setattr(refinement, 'gain_of_objective', gain_of_objective)
+    found = Refiner(Parameters()).run(readings, odometry)
+    assert found.accepted == accepted and found.calibration == {'scale': 0.01}
+    assert len(asked) == by_votes
+    for before, after in asked:
+        assert (before * (1.1, 1.0, 1.0) == after).all()
+    if not accepted:
+        assert found.trajectory is odometry and found.readings is readings
+        assert 'what walls say is doubtful' in found.reason and '(0.2 ± 0.1 nats for each 1.6 m)' in found.reason
+
+
 def test_walls_are_no_proof_if_recognised_places_do_not_confirm(bent, monkeypatch, solved_once) -> None:
     # walls that are not parallel give a wrong yaw, and readings are predicted about as well
     monkeypatch.setattr(refinement, 'match_drive', no_matches)
