@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from collections import Counter, deque
 from collections.abc import Callable, Collection, Mapping
-from typing import Any
+from typing import Any, NamedTuple
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 
@@ -20,11 +20,15 @@ SILENCE = 3.0
 """Seconds without odometry or Range before a warning."""
 
 RECENT = 10.0
-"""Longest time, seconds, over which rejected readings are counted if a sensor measures rarely, so that the status
-does not change with each reading."""
+"""Longest time, seconds, over which rejected readings are counted: if a sensor measures rarely, or many have been
+rejected, so that the status does not change with each reading."""
 
 ENOUGH = 10
 """Readings after which the last second alone is enough."""
+
+MANY, OFTEN, FEW = 0.2, 0.1, 0.05
+"""Fraction of the readings whose rejection gives a warning, if that of the last `RECENT` seconds is above the second
+number as well; and that of these seconds which ends it. One second may have many by chance."""
 
 NEARLY = 0.9
 """Fraction of `max_readings` from which a warning says that readings will be removed."""
@@ -107,8 +111,8 @@ class Health:
     ) -> tuple[bytes, str]:
         received = intake.received
         # called each time, since a reset sets the counters to 0
-        new, by_reason, time_span = self._recent.update(received, associator.rejected)
-        new_rejected = sum(by_reason.values())
+        recent, many = self._recent.update(received, associator.rejected)
+        new, by_reason, time_span = recent
         nowhere = self._silence('frames without a pose', associator.rejected['unknown_extrinsics'])
         refused = sum(associator.odometry_rejected.values())
         # also messages that the associator has not processed yet
@@ -146,11 +150,11 @@ class Health:
             return DiagnosticStatus.WARN, '; '.join([*missing, *filter(None, [without_pose])])
         if without_pose and nowhere < RECENT:
             return DiagnosticStatus.WARN, without_pose
-        if new and new_rejected > 0.2 * new:
+        if many:
             # readings that arrived earlier may have been rejected now
-            new = max(new, new_rejected)
+            new = max(new, by_reason.total())
             return DiagnosticStatus.WARN, (
-                f'{new_rejected} of {new} readings were rejected in the last {time_span}{_main_reason(by_reason)}'
+                f'{by_reason.total()} of {new} readings were rejected in the last {time_span}{_main_reason(by_reason)}'
             )
         wrong = associator.rejected - Counter(paused=associator.rejected['paused'])
         if wrong and not len(associator.buffer):
@@ -178,29 +182,59 @@ class Health:
         return now - since
 
 
+class _Span(NamedTuple):
+    """The readings of a time: the number received, rejected readings by reason, and the time in words."""
+
+    received: int
+    rejected: Counter[str]
+    time: str
+
+    def has(self, fraction: float) -> bool:
+        """Return whether more than this fraction of the readings is rejected."""
+        return self.received > 0 and self.rejected.total() > fraction * self.received
+
+
 class _Recent:
-    """The readings of the last second, or of enough seconds to have `ENOUGH` of them."""
+    """The readings of the last seconds, and whether many of them are rejected."""
 
     def __init__(self) -> None:
         self._counts: deque[tuple[float, int, Counter[str]]] = deque([(time.monotonic(), 0, Counter())])
+        self._many = False
 
-    def update(self, received: int, rejected: Counter[str]) -> tuple[int, Counter[str], str]:
-        """Add the counts; return the number received, rejected readings by reason, and the time span in words."""
+    def update(self, received: int, rejected: Counter[str]) -> tuple[_Span, bool]:
+        """Add the counts; return the span to report, and whether many readings are rejected.
+
+        The span is the last second, or enough seconds to have `ENOUGH` readings. After many rejections it is longer if
+        the last second has fewer.
+        """
         now, looks = time.monotonic(), self._counts
         if received < looks[-1][1]:
             # a reset
             last = looks[-1][0]
             looks.clear()
             looks.append((last, 0, Counter()))
+            self._many = False
         looks.append((now, received, rejected.copy()))
-        while len(looks) > 2 and (received - looks[1][1] >= ENOUGH or now - looks[1][0] >= RECENT):
+        while len(looks) > 2 and now - looks[1][0] >= RECENT:
             looks.popleft()
-        begin, before, counts = looks[0]
-        return received - before, rejected - counts, 'second' if len(looks) == 2 else f'{now - begin:.0f} s'
+        k = len(looks) - 2
+        while k and received - looks[k][1] < ENOUGH:
+            k -= 1
+        span, whole = self._since(k), self._since(0)
+        at_once = span.has(MANY) and whole.has(OFTEN)
+        self._many = at_once or (self._many and whole.has(FEW))
+        return (span if at_once or not self._many else whole), self._many
+
+    def _since(self, k: int) -> _Span:
+        begin, before, counts = self._counts[k]
+        now, received, rejected = self._counts[-1]
+        words = 'second' if len(self._counts) - k == 2 else f'{now - begin:.0f} s'
+        return _Span(received - before, rejected - counts, words)
 
     def begin_anew(self) -> None:
         """Ignore all readings so far."""
         self._counts = deque([self._counts[-1]])
+        self._many = False
 
 
 def add_faults(made: DiagnosticStatus, faults: list[str]) -> None:

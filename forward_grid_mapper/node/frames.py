@@ -212,11 +212,6 @@ class MapFrame:
         return self._lack is None
 
     @property
-    def newest_stamp(self) -> int | None:
-        """The stamp of the newest waiting message, nanoseconds."""
-        return self._held[-1].stamp if self._held else None
-
-    @property
     def lack(self) -> str:
         """The fault that keeps the newest odometry out of the map frame, in words, or ''."""
         if self._lack is None:

@@ -18,7 +18,8 @@ from ..core.messages.message_types import OdometryMessage, RangeMessage, odometr
 from ..core.messages.pose_association import MOST_WAITING, PoseAssociator
 from ..core.messages.rep117 import corrected
 from ..core.messages.repeated_topics import RepeatedTopics
-from .clocks import OdometryClock, SensorClocks
+from .clocks import Arrivals, OdometryClock, SensorClocks
+from .draining import Draining
 from .frames import MapFrame
 from .heard import Heard
 from .losses import LOSS_WARNING, Losses
@@ -80,6 +81,7 @@ class Intake:
         self._repeated_logged: set[str] = set()
         self._odometry_clock = OdometryClock(associator, node.get_logger().warning)
         self._sensor_clocks = SensorClocks(node.get_logger().warning)
+        self._arrivals, self._odometry_arrivals = Arrivals(), Arrivals()
         self._held: deque[tuple[RangeMessage | OdometryMessage | _InMapFrame, int, bool]] = deque()
         self._ranges_held = self._refused = self._losses_logged = self.odometry_came = 0
         self._last_refused: RangeMessage | None = None
@@ -125,18 +127,22 @@ class Intake:
         self.heard.clear()
         self._odometry_clock.forget()
         self._sensor_clocks.clear()
+        self._arrivals.clear()
+        self._odometry_arrivals.clear()
 
     def _losses(self, topic: str) -> Losses:
         return Losses(lambda: int(self._node.count_publishers(self._node.resolve_topic_name(topic))))
 
     def _subscribe(self, kind: Any, topic: str, reliability: str, callback: Any, losses: Losses) -> None:
         quality = QoSProfile(depth=QUEUE, reliability=ReliabilityPolicy[reliability.upper()])
-        subscribe = partial(self._node.create_subscription, kind, topic, callback, quality)
+        draining = Draining(callback)
+        subscribe = partial(self._node.create_subscription, kind, topic, draining, quality)
         try:
             made = subscribe(event_callbacks=SubscriptionEventCallbacks(message_lost=losses.reported))
         except UnsupportedEventTypeError:
             # a middleware need not report losses; those that `Losses` finds in the messages remain
             made = subscribe()
+        draining.subscription = made
         self._subscribed.append(made)
         self.subscriptions[self._node.resolve_topic_name(topic)] = quality
 
@@ -162,9 +168,14 @@ class Intake:
         """Number of Odometry messages lost in the middleware, estimated."""
         return self._odometry_losses.lost
 
+    @property
+    def clock_jumped(self) -> bool:
+        """Whether the stamps of odometry jumped in the last seconds."""
+        return self._odometry_clock.jumped
+
     def faults(self) -> list[str]:
         """Return the faults, in words; losses and clocks are logged as well, at most every few seconds."""
-        clocks = [*self._odometry_clock.faults(), *self._sensor_clocks.faults(self._associator.odometry_stamp)]
+        clocks = [*self._odometry_clock.faults(), *self._sensor_clocks.faults()]
         return [*self._loss_faults(), *clocks, *self.repeated()]
 
     def _loss_faults(self) -> list[str]:
@@ -199,6 +210,10 @@ class Intake:
             '(estimated); they are missing in the maps'
         ]
 
+    def clock_notes(self) -> list[str]:
+        """Return warnings about sensors with wrong stamps for the report, also if these have ended, or none."""
+        return self._sensor_clocks.notes()
+
     def repeated(self) -> list[str]:
         """Return warnings about topics with the same readings; each is logged once."""
         found = self._repeated.notes(
@@ -224,6 +239,8 @@ class Intake:
         losses.taken(info, made.frame_id, made.stamp)
         self.heard.note(made.frame_id)
         self._on_taken(sent)
+        stamp = corrected(made.stamp, self._associator.parameters)
+        self._sensor_clocks.note(made.frame_id, stamp, self._arrivals.of(made.frame_id, info))
         if self._ready and not self._held and not self._associator.behind:
             self._take(made, sent, self.paused)
         elif self._ranges_held >= MOST_WAITING:
@@ -238,6 +255,7 @@ class Intake:
         made, sent = odometry_message(message), info['source_timestamp']
         self.odometry_came += 1
         self._odometry_losses.taken(info, made.frame_id, made.stamp)
+        self._sensor_clocks.note_odometry(made.stamp, self._odometry_arrivals.of('odometry', info))
         if self._ready and not self._held and not self._associator.behind:
             self._take(made, sent, self.paused)
         elif len(self._held) - self._ranges_held < MOST_WAITING:
@@ -281,6 +299,7 @@ class Intake:
         self._repeated = RepeatedTopics()
         self._repeated_logged.clear()
         self._forget_senders()
+        self._sensor_clocks.forget()
 
     @property
     def busy(self) -> bool:
@@ -310,14 +329,7 @@ class Intake:
         elif paused:
             self._associator.reject(message, 'paused')
         else:
-            stamp = corrected(message.stamp, self._associator.parameters)
-            self._sensor_clocks.note(message.frame_id, stamp, self._newest_odometry())
             self._associator.add_range(message, sent)
-
-    def _newest_odometry(self) -> int | None:
-        """Return the newest stamp of odometry received, including messages that wait for TF; None before the first."""
-        stamps = (self._associator.odometry_stamp, self._map_frame.newest_stamp)
-        return max((stamp for stamp in stamps if stamp is not None), default=None)
 
     def _add_odometry(self, message: OdometryMessage, sent: int) -> None:
         self._associator.add_odometry(message, sent)

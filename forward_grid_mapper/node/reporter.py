@@ -20,9 +20,13 @@ from .intake import Intake
 from .journal_keeper import JournalKeeper
 from .kernels import Kernels
 from .live import LiveMap
+from .sensor_status import unsent_warning
 from .surroundings import Surroundings
 from .trajectory import Trajectory
 from .verdict_log import VerdictLog
+
+LONG_SILENT = 60.0
+"""Seconds without a message after which a sensor has stopped sending, if sensors pause whenever there is no echo."""
 
 
 class Reporter:
@@ -58,7 +62,7 @@ class Reporter:
         self._reported: set[str] = set()
         self._without_pose: set[str] = set()
         self._silent_before: set[str] = set()
-        self._no_map_frame = self._no_name = self._far = False
+        self._no_map_frame = self._no_name = self._far = self._unsent = False
         self._out = node.create_publisher(DiagnosticArray, '/diagnostics', 10)
 
     def report(self) -> None:
@@ -89,11 +93,16 @@ class Reporter:
         # faults of frames are logged by the functions that detect them
         silent = statuses[0].message == no_map_frame or statuses[0].message.startswith(diagnostics.NO_POSE)
         bad = statuses[0].level != DiagnosticStatus.OK
-        well = statuses[0].message == diagnostics.MAPPING and not (faults or limits)
+        trajectory = self._trajectory.statuses(name)
+        # after a jump, poses are wrong although all readings are accepted
+        jumped = self._intake.clock_jumped or any(each.level != DiagnosticStatus.OK for each in trajectory)
+        well = statuses[0].message == diagnostics.MAPPING and not (faults or limits or jumped)
         self._verdicts.update([*([statuses[0].message] if bad and not silent else []), *limits], well)
         diagnostics.add_faults(statuses[0], [*faults, *limits, *self._em.wrong_input])
-        statuses += [*self._journal.statuses(name), *self._trajectory.statuses(name)]
-        statuses.append(self._em.sensors.status(name, counts, self._silent(counts)))
+        statuses += [*self._journal.statuses(name), *trajectory]
+        unsent = self._unsent_fault(counts)
+        quiet = self._silent(counts, LONG_SILENT if unsent else 0.0)
+        statuses.append(self._em.sensors.status(name, counts, quiet, unsent))
         statuses.append(self._background(name))
         self._out.publish(diagnostics.array(statuses, self._node.get_clock().now().to_msg()))
 
@@ -111,16 +120,25 @@ class Reporter:
         level = DiagnosticStatus.WARN if failed else DiagnosticStatus.OK
         return diagnostics.status(f'{name}: background', level, message, name, values)
 
-    def _silent(self, counts: Mapping[str, Any]) -> dict[str, float]:
-        """Return silent sensors and the seconds since their last message; log when they stop and when they return."""
-        found = {frame: seconds for frame, seconds in self._intake.heard.silent().items() if frame in counts}
+    def _unsent_fault(self, counts: Mapping[str, tuple[int, int]]) -> str:
+        """Return a warning if a driver seems to send nothing without an echo, or ''; log it once."""
+        fault = unsent_warning(self._intake.heard.pauses, counts)
+        if fault and not self._unsent:
+            self._node.get_logger().warning(fault)
+        self._unsent = bool(fault)
+        return fault
+
+    def _silent(self, counts: Mapping[str, Any], least: float = 0.0) -> dict[str, float]:
+        """Return sensors that are silent for so long, and for how many seconds; log when they stop and return."""
+        silent = self._intake.heard.silent()
+        found = {frame: seconds for frame, seconds in silent.items() if frame in counts and seconds >= least}
         log = self._node.get_logger()
         if new := found.keys() - self._silent_before:
             log.warning(f'these sensors have stopped sending: {diagnostics.listed(new)}')
         # after a reset, nothing is known of sensors that were silent
-        if back := [frame for frame in self._silent_before - found.keys() if frame in self._intake.heard]:
+        if back := [frame for frame in self._silent_before - silent.keys() if frame in self._intake.heard]:
             log.info(f'these sensors send again: {diagnostics.listed(back)}')
-        self._silent_before = set(found)
+        self._silent_before = set(found) | (self._silent_before & silent.keys())
         return found
 
     def _map_frame_fault(self) -> str:

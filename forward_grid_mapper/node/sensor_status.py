@@ -8,7 +8,32 @@ from diagnostic_msgs.msg import DiagnosticStatus
 
 from ..core.common.words import counted
 from ..core.learning.sensor_health import SensorHealth, health_warning
+from ..core.messages.rep117 import NONE
 from .diagnostics import listed, status
+
+PAUSES, ENOUGH, RARE = 5, 100, 1000
+"""Pauses of sensors, and readings, from which a driver that sends nothing without an echo is likely; and readings for
+each pause from which it is not."""
+
+
+def unsent_warning(pauses: int, counts: Mapping[str, tuple[int, int]]) -> str:
+    """Return a warning that a driver seems to send nothing if there is no echo, or ''.
+
+    Parameters
+    ----------
+    pauses : int
+        How often sensors paused (`Heard.pauses`).
+    counts : mapping of str to (int, int)
+        From `ReadingBuffer.counts`.
+    """
+    readings, silent = (sum(numbers[k] for numbers in counts.values()) for k in (0, 1))
+    if pauses < max(PAUSES, readings / RARE) or readings < ENOUGH or silent > NONE * readings:
+        return ''
+    return (
+        f'sensors stopped sending for half a second or more, and sent again, {pauses} times so far, and hardly any '
+        'reading is without an echo: does the driver send nothing if there is no echo? It must send +inf then (REP '
+        '117), since these readings show which space is free'
+    )
 
 
 class SensorWatch:
@@ -26,7 +51,11 @@ class SensorWatch:
         self._table = table
 
     def status(
-        self, name: str, counts: Mapping[str, tuple[int, int]], quiet: Mapping[str, float] | None = None
+        self,
+        name: str,
+        counts: Mapping[str, tuple[int, int]],
+        quiet: Mapping[str, float] | None = None,
+        unsent: str = '',
     ) -> DiagnosticStatus:
         """Return the status of all sensors, with a key for each.
 
@@ -38,6 +67,8 @@ class SensorWatch:
             Readings accepted so far, and those without echo; for sensors that are not in the table.
         quiet : dict of name → float, optional
             Seconds since the last message of sensors that have stopped sending.
+        unsent : str
+            From `unsent_warning`.
         """
         quiet = quiet or {}
         table = self._table
@@ -49,7 +80,7 @@ class SensorWatch:
         for sensor, seconds in quiet.items():
             values[sensor] = f'SILENT for {seconds:.0f} s; {values.get(sensor, "")}'
         silence = f'{listed(quiet)}: no more messages' if quiet else ''
-        warning = '; '.join(filter(None, [silence, health_warning(table)]))
+        warning = '; '.join(filter(None, [silence, unsent, health_warning(table)]))
         message = warning or ('none differs from the others' if table else 'judged after EM')
         level = DiagnosticStatus.WARN if warning else DiagnosticStatus.OK
         return status(f'{name}: sensors', level, message, name, values)

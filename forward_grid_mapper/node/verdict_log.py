@@ -1,4 +1,4 @@
-"""The log of input faults: each fault once it lasts, and the end of all faults."""
+"""The log of input faults: each fault once it lasts, and the end of all faults once that lasts."""
 
 from __future__ import annotations
 
@@ -9,6 +9,10 @@ from typing import Any
 
 LOOKS = 2
 """Consecutive checks, a second apart, after which a fault is logged: at the start, some faults pass."""
+
+ENDED = 10
+"""Consecutive checks without a fault after which it has ended: many faults come and go, and some take seconds to be
+found."""
 
 AGAIN = 60.0
 """Seconds before a fault that returned is logged again."""
@@ -27,15 +31,17 @@ class VerdictLog:
         self._log = logger
         self._seen: dict[str, int] = {}
         self._logged: dict[str, float] = {}
-        self._open: set[str] = set()
+        self._open: dict[str, int] = {}
         self._bad = False
+        self._well = 0
 
     def update(self, faults: Sequence[str], well: bool) -> None:
         """Update with the current faults, and whether mapping is free of faults; numbers do not distinguish faults."""
         now = time.monotonic()
         kinds = {_NUMBER.sub('#', fault): fault for fault in faults}
         self._seen = {kind: self._seen.get(kind, 0) + 1 for kind in kinds}
-        self._open.intersection_update(kinds)
+        absent = {kind: 0 if kind in kinds else checks + 1 for kind, checks in self._open.items()}
+        self._open = {kind: checks for kind, checks in absent.items() if checks < ENDED}
         for kind, fault in kinds.items():
             # a fault that returned too early is logged later, if it lasts
             if kind in self._open or self._seen[kind] < LOOKS or now < self._logged.get(kind, -AGAIN) + AGAIN:
@@ -43,9 +49,10 @@ class VerdictLog:
             if len(self._logged) >= MOST:
                 self._logged.clear()
             self._logged[kind] = now
-            self._open.add(kind)
+            self._open[kind] = 0
             self._bad = True
             self._log.warning(fault)
-        if self._bad and well:
+        self._well = self._well + 1 if well and not kinds else 0
+        if self._bad and self._well >= ENDED:
             self._bad = False
             self._log.info('readings are mapped without faults again')

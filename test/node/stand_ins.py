@@ -84,7 +84,13 @@ SONAR = Pose2(0.1, 0.0, 0.0)
 
 
 class Taking:
-    """An intake with its associator, and a robot that publishes to it."""
+    """An intake with its associator, and a robot that publishes to it.
+
+    Attributes
+    ----------
+    arrival : float or None
+        Time, seconds, at which the middleware receives the next messages; if None, that of their stamps.
+    """
 
     def __init__(self, at_once: int = AT_ONCE, map_frame: MapFrame | None = None, **parameters: Any) -> None:
         self.node = PlainNode()
@@ -94,13 +100,18 @@ class Taking:
         frame = map_frame or MapFrame('', Transforms(), 1.0)
         self.intake = Intake(self.node, own, self.associator, frame, self.published.append)
         self.sent = 0
+        self.arrival: float | None = None
+
+    def _info(self, seconds: float) -> dict[str, Any]:
+        arrival = seconds if self.arrival is None else self.arrival
+        return {'source_timestamp': round(seconds * 1e9), 'received_timestamp': round(arrival * 1e9)}
 
     def odometry(self, seconds: float, x: float = 0.0, number: int | None = None, frame: str = 'odom') -> None:
         made = Odometry(child_frame_id='base_link')
         made.header.frame_id = frame
         made.pose.pose.position.x, made.pose.pose.orientation.w = x, 1.0
         made.header.stamp.sec, made.header.stamp.nanosec = divmod(round(seconds * 1e9), 10**9)
-        info: dict[str, Any] = {'source_timestamp': round(seconds * 1e9)}
+        info = self._info(seconds)
         if number is not None:
             info['publication_sequence_number'] = number
         self.intake.on_odometry(made, info)
@@ -110,7 +121,7 @@ class Taking:
         made.header.frame_id = frame
         made.header.stamp.sec, made.header.stamp.nanosec = divmod(round(seconds * 1e9), 10**9)
         self.sent += 1
-        info = {'source_timestamp': round(seconds * 1e9), 'publication_sequence_number': number or self.sent}
+        info = {**self._info(seconds), 'publication_sequence_number': number or self.sent}
         self.intake.on_range(self.intake.range_losses[topic], made, info)
 
     def account(self) -> tuple[int, int, int, int]:

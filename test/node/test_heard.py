@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from types import SimpleNamespace
+from typing import Any
 
 import pytest
 
@@ -13,7 +14,8 @@ from inside import Inside
 
 from forward_grid_mapper.core.messages.sensor_records import MOST_FRAMES
 from forward_grid_mapper.node import heard
-from forward_grid_mapper.node.heard import TIME_OUT, USUAL, Heard
+from forward_grid_mapper.node.heard import PAUSE, TIME_OUT, USUAL, Heard
+from forward_grid_mapper.node.sensor_status import PAUSES
 
 OK, WARN = b'\x00', b'\x01'
 
@@ -58,6 +60,28 @@ def test_sensor_that_stops_is_silent_until_it_sends_again(clock: Clock) -> None:
     # the gap is not used as the usual interval
     pass_by(clock, sensors, TIME_OUT + 0.5, right=0.1)
     assert set(sensors.silent()) == {'left'}
+
+
+def test_pauses_are_counted_if_others_send_meanwhile(clock: Clock) -> None:
+    sensors = Heard()
+    pass_by(clock, sensors, 10.0, left=0.1, right=0.1, slow=0.5)
+    assert sensors.pauses == 0
+    for k in range(3):
+        pass_by(clock, sensors, PAUSE + 0.5 + k, right=0.1, slow=0.5)
+        pass_by(clock, sensors, 5.0, left=0.1, right=0.1, slow=0.5)
+        assert sensors.pauses == k + 1
+    # too short, or none of the sensor alone
+    pass_by(clock, sensors, PAUSE - 0.3, right=0.1, slow=0.5)
+    pass_by(clock, sensors, 5.0, left=0.1, right=0.1, slow=0.5)
+    for seconds in (2.0, 20.0):
+        pass_by(clock, sensors, seconds)
+        pass_by(clock, sensors, 5.0, left=0.1, right=0.1, slow=0.5)
+    # the slow sensor may be late
+    pass_by(clock, sensors, 2.0, left=0.1, right=0.1)
+    pass_by(clock, sensors, 5.0, left=0.1, right=0.1, slow=0.5)
+    assert sensors.pauses == 3
+    sensors.clear()
+    assert sensors.pauses == 0
 
 
 def test_no_sensor_is_silent_if_all_have_stopped(clock: Clock) -> None:
@@ -159,3 +183,44 @@ def test_diagnostics_name_the_silent_sensor(inside: Callable[..., Inside], monke
         'these sensors send again: other',
         'these sensors have stopped sending: sonar',
     ]
+
+
+@pytest.mark.parametrize('inf', [False, True])
+def test_driver_that_sends_nothing_without_echo_is_named(
+    inside: Callable[..., Inside], monkeypatch: pytest.MonkeyPatch, inf: bool
+) -> None:
+    """Pauses are no silence then, unless they last; if some readings are without an echo, a sensor is broken."""
+    robot = inside(**{'sensors.other.pose': [0.1, 0.0, 1.0]}).start()
+    clock = Clock(monkeypatch)
+    lines: list[str] = []
+    log = SimpleNamespace(info=lines.append, warning=lines.append, error=lines.append)
+    monkeypatch.setattr(robot.node, 'get_logger', lambda: log)
+    sent = 0
+
+    def drive(seconds: float, *frames: str) -> dict[str, Any]:
+        nonlocal sent
+        for _ in range(round(10 * seconds)):
+            sent, clock.now = sent + 1, clock.now + 0.1
+            robot.odometry(100.0 + 0.05 * sent, 0.001 * sent)
+            for frame in frames:
+                robot.range(100.0 + 0.05 * sent, 6.0 if inf and sent % 20 == 0 else 2.0, frame=frame)
+        robot.until(lambda: not robot.node.intake.busy)
+        return robot.status('sensors')
+
+    for _ in range(PAUSES):
+        drive(2.0, 'sonar', 'other')
+        drive(2.0, 'sonar')
+    status = drive(2.0, 'sonar', 'other')
+    assert ('does the driver send nothing if there is no echo?' in status['message']) != inf
+    assert (status['level'] == WARN) != inf
+    drive(4.0, 'sonar')
+    drive(2.0, 'sonar', 'other')
+    ends = ['these sensors have stopped sending: other', 'these sensors send again: other']
+    if inf:
+        assert lines == ends
+        return
+    (fault,) = lines
+    assert '+inf' in fault
+    assert 'other: no more messages' in drive(70.0, 'sonar')['message']
+    drive(2.0, 'sonar', 'other')
+    assert lines == [fault, *ends]

@@ -321,6 +321,8 @@ def test_share_of_rejected_readings_is_reported_with_reason(inside: Callable[...
     assert readings['level'] == WARN
     assert '5 of 20 readings were rejected in the last second, most of them as below_min_range' in readings['message']
     robot.drive(35, 15)
+    assert '5 of 55 readings were rejected' in robot.status('readings')['message'], 'still many of ten seconds'
+    robot.drive(50, 100)
     assert robot.status('readings')['level'] == OK
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from random import Random
 from types import SimpleNamespace
 from typing import Any
 
@@ -15,11 +16,11 @@ from stand_ins import PlainNode, Taking
 from forward_grid_mapper.core.common.grid import Grid
 from forward_grid_mapper.core.messages.message_types import NANOSECONDS, Pose2
 from forward_grid_mapper.node import diagnostics
-from forward_grid_mapper.node.diagnostics import Health
+from forward_grid_mapper.node.diagnostics import RECENT, Health
 from forward_grid_mapper.node.frames import Extrinsics, MapFrame, Transforms
 from forward_grid_mapper.node.heard import USUAL
 from forward_grid_mapper.node.reporter import Reporter
-from forward_grid_mapper.node.verdict_log import LOOKS, VerdictLog
+from forward_grid_mapper.node.verdict_log import ENDED, LOOKS, VerdictLog
 
 OK, WARN = b'\x00', b'\x01'
 
@@ -39,7 +40,7 @@ def drive(robot: Taking, first: int, good: int, bad: int, frame: str = '') -> No
         robot.range(100.0 + 0.05 * k, 'sonar' if k < first + good else frame)
 
 
-def test_reason_is_that_of_the_last_second_also_after_a_reset() -> None:
+def test_reason_is_that_of_the_last_second_also_after_a_reset(clock: Any) -> None:
     robot, health = Taking(), Health()
     robot.intake.begin()
     drive(robot, 0, 10, 90)
@@ -48,6 +49,7 @@ def test_reason_is_that_of_the_last_second_also_after_a_reset() -> None:
     drive(robot, 150, 0, 5)
     level, message = judged(robot, health)
     assert level == WARN and '15 of 55' in message and 'most of them as long_frame_id' in message
+    clock.now += RECENT
     drive(robot, 155, 50, 0)
     assert judged(robot, health) == (OK, 'mapping')
     robot.associator.clear()
@@ -58,6 +60,33 @@ def test_reason_is_that_of_the_last_second_also_after_a_reset() -> None:
     drive(robot, 255, 0, 15, 'x' * 1000)
     level, message = judged(robot, health)
     assert level == WARN and '55 of 65' in message and 'most of them as empty_frame_id' in message
+
+
+@pytest.mark.parametrize(('share', 'expected'), [(0.33, {WARN}), (0.12, {WARN}), (0.05, {OK})])
+def test_constant_share_of_rejected_readings_has_a_constant_verdict(
+    clock: Any, share: float, expected: set[bytes]
+) -> None:
+    """Of 20 readings a second by chance, as of a driver that sends 0 if there is no echo."""
+    robot, health, random = Taking(), Health(), Random(1)
+    robot.intake.begin()
+    levels = []
+    for second in range(200):
+        clock.now += 1.0
+        for k in range(20 * second, 20 * second + 20):
+            robot.odometry(100.0 + 0.05 * k)
+            # at first, so many that there is a warning for the other shares as well
+            bad = random.random() < (0.5 if second < 5 and expected == {WARN} else share)
+            robot.range(100.0 + 0.05 * k, '' if bad else 'sonar')
+        level, text = judged(robot, health)
+        levels.append(level)
+    assert set(levels[5:]) == expected
+    if expected == {WARN}:
+        # it ends ten seconds after the last rejection at the latest
+        for second in range(200, 211):
+            clock.now += 1.0
+            drive(robot, 20 * second, 20, 0)
+            level, text = judged(robot, health)
+        assert (level, text) == (OK, 'mapping')
 
 
 def test_delay_is_zero_without_times_of_the_middleware() -> None:
@@ -296,8 +325,38 @@ def test_end_of_faults_is_logged_only_if_readings_are_mapped(inside: Any) -> Non
     looks(LOOKS)
     assert log.warned == [fault]
     robot.drive(40, 20)
-    looks(LOOKS)
+    looks(ENDED - 1)
+    assert log.warned == [fault]
+    looks(1)
     assert log.warned == [fault, 'readings are mapped without faults again']
+
+
+@pytest.mark.parametrize('kind', ['of the clock', 'of the robot'])
+def test_end_of_faults_is_not_logged_after_a_jump(inside: Any, kind: str) -> None:
+    robot = inside(refine_poses=True).start()
+    node, log = robot.node, PlainNode()
+    node.reporter._verdicts = VerdictLog(log)
+    robot.drive(0, 20)
+    for k in range(20, 40):
+        robot.odometry(100.0 + 0.05 * k, 0.02)
+        robot.range(100.0 + 0.05 * k, frame='')
+    for _ in range(LOOKS):
+        robot.status('readings')
+    assert len(log.warned) == 1
+    if kind == 'of the clock':
+        robot.drive(0, 500)
+    else:
+        # so that the last pose is known
+        robot.spin(0.5)
+        for k in range(40, 500):
+            robot.odometry(100.0 + 0.05 * k, 5.0)
+            robot.range(100.0 + 0.05 * k)
+        robot.until(lambda: robot.status('trajectory')['level'] == WARN, 20.0)
+    assert len(log.warned) == 1
+    for _ in range(ENDED + 5):
+        status = robot.status('readings')
+    assert status['message'] == 'mapping'
+    assert len(log.warned) == 1
 
 
 def reporter_of(robot: Taking) -> Any:

@@ -10,7 +10,7 @@ pytest.importorskip('rclpy', reason='the tests of the node need rclpy')
 
 from stand_ins import PlainNode
 
-from forward_grid_mapper.node.verdict_log import AGAIN, MOST, VerdictLog
+from forward_grid_mapper.node.verdict_log import AGAIN, ENDED, MOST, VerdictLog
 
 WELL = 'readings are mapped without faults again'
 
@@ -21,6 +21,9 @@ def test_lasting_fault_is_logged_once_at_any_numbers(clock: Any) -> None:
     for k in range(3, 200):
         log.update([f'no Range for {k} s'], False)
         clock.now += 1.0
+    assert node.warned == ['no Range for 4 s']
+    for _ in range(ENDED - 1):
+        log.update([], True)
     assert node.warned == ['no Range for 4 s']
     log.update([], True)
     log.update([], True)
@@ -36,21 +39,31 @@ def test_short_fault_is_not_logged(clock: Any) -> None:
     assert node.warned == []
 
 
-def test_intermittent_fault_is_logged_once_a_minute(clock: Any) -> None:
+def test_intermittent_fault_is_logged_once_and_has_no_end(clock: Any) -> None:
     node = PlainNode()
     log = VerdictLog(node)
     for _ in range(int(2 * AGAIN) // 3):
         for faults in (['gap'], ['gap'], []):
             log.update(faults, not faults)
             clock.now += 1.0
-    assert node.warned == ['gap', WELL] * 2
+    assert node.warned == ['gap']
+
+
+def test_end_of_faults_is_not_logged_before_one_that_takes_longer_to_be_found(clock: Any) -> None:
+    """A sensor with a wrong clock is rejected at first, and its clock is found five seconds later."""
+    node = PlainNode()
+    log = VerdictLog(node)
+    for second in range(40):
+        log.update(['rejected'] if second < 3 else [], well=3 <= second < 8 or second >= 20)
+        clock.now += 1.0
+        assert (WELL in node.warned) == (second >= 20 + ENDED - 1)
 
 
 def test_fault_that_returns_and_lasts_is_logged_again(clock: Any) -> None:
     node = PlainNode()
     log = VerdictLog(node)
     for second in range(300):
-        faults = [] if 5 <= second < 10 else ['gap']
+        faults = [] if 5 <= second < 5 + ENDED else ['gap']
         log.update(faults, not faults)
         clock.now += 1.0
     assert node.warned == ['gap', WELL, 'gap']
