@@ -33,14 +33,16 @@ from .refining import RefiningMapper
 class Outcome:
     """The result of a run: `maps`, or None with the reason in `message`.
 
-    `warnings` are faults of the readings, `health` is that of each sensor, `trajectory` describes the trajectory,
-    `waited` is the time until kernels were compiled, seconds.
+    `warnings` are faults of the readings, with those that `Run.inspect` found, which are in `drive` as well; `health`
+    is that of each sensor, `trajectory` describes the trajectory, `waited` is the time until kernels were compiled,
+    seconds.
     """
 
     maps: MapSet | None
     message: str
     trajectory: str = ''
     warnings: list[str] = field(default_factory=list)
+    drive: list[str] = field(default_factory=list)
     health: dict[str, SensorHealth] = field(default_factory=dict)
     waited: float = 0.0
 
@@ -160,7 +162,8 @@ class EmWorker:
         """Add the health of sensors and warnings; the maps are valid without them."""
         try:
             outcome.health = sensor_health(maps)
-            outcome.warnings = [*without_echoes(maps.readings), *input_warnings(maps.readings), *inspect()]
+            outcome.drive = list(inspect())
+            outcome.warnings = [*without_echoes(maps.readings), *input_warnings(maps.readings), *outcome.drive]
         except Exception as error:
             outcome.warnings = [f'sensors could not be judged: {error!r}']
 

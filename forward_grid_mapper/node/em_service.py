@@ -90,11 +90,15 @@ class EmService:
         How the last run ended.
     wrong_input : list of str
         Faults of the readings of the latest run.
+    drive_faults : list of str
+        Those of them that are faults of the odometry of the drive.
     sensors : SensorWatch
     online : OnlineWorker or None
         Gives the map to start from, and receives the result.
     range_topics : sequence of str
         Full names, for messages, as is `odom_topic`.
+    clock_notes : callable
+        Returns warnings about stamps of sensors that differ from those of odometry.
     no_map_frame : callable
         Returns the fault that keeps odometry out of the map frame, in words, or ''.
     extrinsics : callable
@@ -118,10 +122,12 @@ class EmService:
         self.explained = 0
         self.last_run = 'none yet'
         self.wrong_input: list[str] = []
+        self.drive_faults: list[str] = []
         self.sensors = SensorWatch()
         self.online: OnlineWorker | None = None
         self.range_topics: Sequence[str] = ()
         self.odom_topic = ''
+        self.clock_notes: Callable[[], list[str]] = list
         self.no_map_frame: Callable[[], str] = str
         self.extrinsics: Callable[[], Mapping[str, Pose2]] = dict
         self.mounts: Callable[[], Mapping[str, Pose2]] = dict
@@ -238,7 +244,8 @@ class EmService:
         if self.current is not None:
             _fail_all(self.current.then, 'EM was cancelled by reset')
         self._generation = self._publishers.generation
-        self.maps, self.found, self.wrong_input, self.last_run = None, None, [], 'none since the reset'
+        self.maps, self.found, self.last_run = None, None, 'none since the reset'
+        self.wrong_input, self.drive_faults = [], []
         self.sensors.clear()
         self._checked = None
 
@@ -361,7 +368,8 @@ class EmService:
                 self.online.show()
             return
         self.maps, self.found, self.explained = maps, self._trajectory.found, count
-        self.wrong_input = outcome.warnings
+        outcome.warnings += self.clock_notes()
+        self.wrong_input, self.drive_faults = outcome.warnings, outcome.drive
         self.sensors.take(outcome.health)
         if self.online:
             self.online.adopt(maps)

@@ -148,7 +148,7 @@ class MapperNode(ManagedNode):
         trajectory.refine = lambda: self.mapping and self.em.run_by_itself()
         self._extrinsics = extrinsics
         self.em.range_topics, self.em.odom_topic = ranges, odometry
-        self.em.no_map_frame = lambda: self._map_frame.lack
+        self.em.no_map_frame, self.em.clock_notes = lambda: self._map_frame.lack, lambda: self.intake.clock_notes()
         self.em.extrinsics, self.em.mounts = lambda: extrinsics.fixed, lambda: extrinsics.known
         self.em.online = self.online
         self.saver = Saver(self.em, self.live, self._account, log)
@@ -386,6 +386,8 @@ class MapperNode(ManagedNode):
                 *associator.message_warnings(),
                 *self.intake.loss_note(),
                 *self.intake.repeated(),
+                *self.intake.clock_notes(),
+                *self.em.drive_faults,
                 *rejections,
             ],
         }

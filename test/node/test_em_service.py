@@ -439,6 +439,17 @@ def test_jump_of_odometry_is_named_in_the_response(robot: EmRobot) -> None:
     answer = robot.run_em()
     robot.settle()
     assert 'WARNING: odometry jumps once, by 4.2 m after 1 m of driving' in answer.sent[0][1]
+    # the report has it as well
+    assert len(robot.em.drive_faults) == 1 and robot.em.drive_faults == robot.em.wrong_input
+    robot.em.reset()
+    assert not robot.em.drive_faults
+
+
+def test_wrong_stamps_of_sensors_are_named_in_the_response(robot: EmRobot) -> None:
+    robot.em.clock_notes = lambda: ['the stamps of sonar are 2.5 s behind']
+    answer = robot.run_em()
+    robot.settle()
+    assert 'WARNING: the stamps of sonar are 2.5 s behind' in answer.sent[0][1]
 
 
 def test_consistency_is_checked_again_when_the_readings_have_doubled(robot: EmRobot) -> None:
