@@ -148,7 +148,7 @@ class MapperNode(ManagedNode):
         trajectory.refine = lambda: self.mapping and self.em.run_by_itself()
         self._extrinsics = extrinsics
         self.em.range_topics, self.em.odom_topic = ranges, odometry
-        self.em.no_map_frame, self.em.clock_notes = lambda: self._map_frame.lack, lambda: self.intake.clock_notes()
+        self.em.no_map_frame = lambda: self._map_frame.lack
         self.em.extrinsics, self.em.mounts = lambda: extrinsics.fixed, lambda: extrinsics.known
         self.em.online = self.online
         self.saver = Saver(self.em, self.live, self._account, log)
@@ -159,6 +159,7 @@ class MapperNode(ManagedNode):
         self.workers += [part.worker for part in (self.saver, self.online, trajectory.following, kernels) if part]
         health = Health()
         self.intake = Intake(self, self.parameters, self.associator, self._map_frame, health.taken)
+        self.em.clock_notes = self.intake.clock_notes
         trajectory.listening = lambda: self.intake.listening
         self.reporter = Reporter(
             self,

@@ -17,6 +17,7 @@ from rclpy.qos import ReliabilityPolicy
 from sensor_msgs.msg import Range
 from stand_ins import Taking
 
+from forward_grid_mapper.node import draining
 from forward_grid_mapper.node import intake as module
 from forward_grid_mapper.node.frames import MapFrame, Transforms
 from forward_grid_mapper.node.intake import AT_ONCE, QUEUE
@@ -367,6 +368,7 @@ def test_failed_subscription_removes_all_subscriptions(monkeypatch: pytest.Monke
 
 
 def test_waiting_messages_of_a_topic_are_received_in_one_call(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(draining, 'LONGEST', 60.0)
     robot = Taking()
     waiting = deque(range(1, 5))
 
