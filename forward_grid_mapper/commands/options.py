@@ -280,6 +280,9 @@ INSTEAD = {
 }
 """Offline replacements of parameters of the node."""
 
+OTHER_MAPS = INSTEAD.keys() - {'save_directory'}
+"""Those of them that change the maps; the node's other parameters are meant for the node alone."""
+
 
 def chosen_parameters(options: argparse.Namespace) -> Chosen:
     """Return the parameters and the sensor poses of `--params` and `--set`.
@@ -297,7 +300,7 @@ def chosen_parameters(options: argparse.Namespace) -> Chosen:
         if name not in DEPRECATED and find(name).group == 'node':
             instead = f'; {INSTEAD[name]}' if name in INSTEAD else ''
             raise ParameterError(f'--set {name}: this parameter is only for the node{instead}')
-    warnings = [text] if (text := _ignored(values, options.params)) else []
+    warnings = [text] if (text := _ignored(values, options)) else []
     parameters = Parameters.from_flat({**values, **settings})
     if options.dump_config:
         print(dump_parameters(parameters), end='')
@@ -305,11 +308,14 @@ def chosen_parameters(options: argparse.Namespace) -> Chosen:
     return Chosen(parameters, dict(extrinsics), warnings)
 
 
-def _ignored(values: Mapping[str, Any], source: str) -> str:
-    """Return a warning about parameters of a file that have no effect offline; otherwise ''."""
-    known = {name: value for name, value in values.items() if name not in DEPRECATED}
-    names = [name for name, value in known.items() if find(name).group == 'node' and value != find(name).default]
+def _ignored(values: Mapping[str, Any], options: argparse.Namespace) -> str:
+    """Return a warning about parameters of a file by which the maps of the node would be others; otherwise ''."""
+    names = [
+        name
+        for name in sorted(OTHER_MAPS & values.keys())
+        if values[name] != find(name).default and not getattr(options, name, None)
+    ]
     if not names:
         return ''
-    listed = [f'{name} ({INSTEAD[name]})' if name in INSTEAD else name for name in names]
-    return f'{readable(source)}: these parameters are only for the node and are ignored: {", ".join(listed)}'
+    listed = [f'{name} ({INSTEAD[name]})' for name in names]
+    return f'{readable(options.params)}: these parameters are only for the node and are ignored: {", ".join(listed)}'

@@ -255,7 +255,8 @@ def _parameters(data: dict[str, Any]) -> Iterator[str]:
     width = max(map(len, changed))
     for name, row in changed.items():
         value = f'{row["value"]:.6g}' if isinstance(row['value'], float) else row['value']
-        yield f'  {name:<{width}}  {value}  (default {row["default"]})'
+        default = 'empty' if row['default'] == '' else row['default']
+        yield f'  {name:<{width}}  {value}  (default {default})'
 
 
 def _line(label: str, text: object) -> Iterator[str]:

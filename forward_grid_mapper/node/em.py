@@ -35,7 +35,7 @@ class Outcome:
 
     `warnings` are faults of the readings, with those that `Run.inspect` found, which are in `drive` as well; `health`
     is that of each sensor, `trajectory` describes the trajectory, `waited` is the time until kernels were compiled,
-    seconds.
+    seconds. `replaced` is true if a call has replaced a run of the node itself.
     """
 
     maps: MapSet | None
@@ -43,6 +43,7 @@ class Outcome:
     trajectory: str = ''
     warnings: list[str] = field(default_factory=list)
     drive: list[str] = field(default_factory=list)
+    replaced: bool = False
     health: dict[str, SensorHealth] = field(default_factory=dict)
     waited: float = 0.0
 

@@ -297,6 +297,7 @@ class EmService:
                 outcome.message = nothing_to_map(self._associator, self.range_topics, self.odom_topic, lack)
             elif outcome.maps is None and run.then:
                 outcome.message = 'the run that the node began by itself (refine_every) was replaced by run_em'
+                outcome.replaced = True
             self._finish(outcome, taken[0][0])
             if outcome.maps is None and run.shown:
                 self._publishers.publish('ml_map', generation, *before)
@@ -362,7 +363,9 @@ class EmService:
         maps = outcome.maps
         if maps is None:
             self.last_run = outcome.message
-            self._logger.warning(outcome.message if outcome.message.startswith('EM ') else f'EM: {outcome.message}')
+            text = outcome.message if outcome.message.startswith('EM ') else f'EM: {outcome.message}'
+            # a call that replaces a run of the node itself is no fault
+            (self._logger.info if outcome.replaced else self._logger.warning)(text)
             if self.online:
                 # maps that it made during EM were not published
                 self.online.show()

@@ -184,7 +184,8 @@ def test_changed_node_parameters_in_a_file_give_a_warning(
     report = mapped(path, tmp_path / 'maps', '--params', file, '-q')
     (warning,) = (w for w in report['warnings'] if 'only for the node' in w)
     assert str(file) in warning and "map_frame (the maps are in odometry's frame)" in warning
-    assert 'publish_rate' in warning and 'odom_topic' not in warning, 'a default changes nothing'
+    assert 'odom_topic' not in warning, 'a default changes nothing'
+    assert 'publish_rate' not in warning, 'it changes no map'
     assert 'p_hit' not in warning
     assert warning in capsys.readouterr().err
     assert 'map_frame' in (tmp_path / 'maps' / 'report.txt').read_text()
@@ -192,13 +193,19 @@ def test_changed_node_parameters_in_a_file_give_a_warning(
     assert f'learn: warning: {warning}' in capsys.readouterr().err
 
 
-def test_each_node_parameter_in_a_file_gives_a_warning(tmp_path: Path) -> None:
+def test_each_node_parameter_in_a_file_that_changes_maps_gives_a_warning(tmp_path: Path) -> None:
     other = {float: 3.25, str: 'reliable', tuple: ['x'], int: 3}
     for row in NODE:
         file = tmp_path / f'{row.name}.yaml'
         file.write_text(f'{row.name}: {str(not row.default if row.type is bool else other[row.type]).lower()}')
         chosen = chosen_parameters(process_bag.parser().parse_args(['bag', '--params', str(file)]))
-        assert len(chosen.warnings) == 1 and row.name in chosen.warnings[0]
+        assert len(chosen.warnings) == (row.name in ('range_topics', 'odom_topic', 'map_frame', 'refine_poses'))
+        assert all(row.name in warning for warning in chosen.warnings)
+        # the parameter file of the node, and the option that has the same effect
+        for option, *value in (['--refine-poses'], ['--odom-topic', 'odom'], ['--range-topics', 'sonar']):
+            if row.name == option[2:].replace('-', '_'):
+                given = process_bag.parser().parse_args(['bag', '--params', str(file), option, *value])
+                assert not chosen_parameters(given).warnings
     file = tmp_path / 'defaults.yaml'
     file.write_text(dump_parameters(chosen.parameters.__class__()))
     assert chosen_parameters(process_bag.parser().parse_args(['bag', '--params', str(file)])).warnings == []

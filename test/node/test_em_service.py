@@ -172,6 +172,7 @@ def test_outdated_automatic_run_is_replaced_by_a_call(held: EmRobot, why: str) -
     assert held.searches[0].cancelled and answer.sent == []
     held.until(lambda: len(held.searches) == 2)
     assert held.em.last_run == 'the run that the node began by itself (refine_every) was replaced by run_em'
+    assert not any('replaced by run_em' in text for text in held.node.warned)
     assert waiting == [], 'it waits for the other run'
     held.begun().go_on.set()
     held.settle()
