@@ -85,19 +85,19 @@ def with_workers(
 ) -> int:
     """Run the command with its options; `default` is the name of the folder, and `tell` prints the result."""
     from ..scale.extra import need
+    from ..scale.work_folder import WorkFolder
 
     need()
     _check(options)
+    output = Path(options.output) if options.output else free_name(Path.cwd(), default)
+    work = WorkFolder(str(Path(options.work or beside(output)).resolve()))
+    check_apart(output, work.root)
     # imported late: they need the extra
     from ..scale.cluster import Cluster
     from ..scale.job import Job, Recordings, versions
     from ..scale.mapping import ScaledMapper
     from ..scale.output import write_output
-    from ..scale.work_folder import WorkFolder
 
-    output = Path(options.output) if options.output else free_name(Path.cwd(), default)
-    work = WorkFolder(str(Path(options.work or beside(output)).resolve()))
-    check_apart(output, work.root)
     memory = int((options.memory_per_worker or MEMORY) * 1e9)
     size = TILE if options.tiles is None else options.tiles
     meant = find_recordings(options.bags)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -33,7 +34,8 @@ def started(closed: str, *words: object) -> subprocess.CompletedProcess[str]:
 def test_command_works_with_closed_streams(tmp_path: Path, closed: str) -> None:
     folder = tmp_path / 'drive'
     done = started(closed, '-m', 'forward_grid_mapper', 'simulate', 'door', '--seen', 1, '-o', folder)
-    assert (done.returncode, done.stderr) == (0, '')
+    # a slow machine also shows progress
+    assert (done.returncode, re.sub(r' *\d+ s  \w+\n', '', done.stderr)) == (0, '')
     assert (folder / 'bag' / 'metadata.yaml').is_file()
     assert ('readings' in done.stdout) == ('>&-' not in closed.split())
 
