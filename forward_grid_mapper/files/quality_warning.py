@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 import numpy as np
 
 from ..core.common.parameters import Parameters
-from ..core.common.readings import Readings, drives_of
+from ..core.common.readings import Floats, Readings, drives_of
 from ..core.drive_changes import change_warnings
 from ..core.drive_fit import fit_warnings
 from ..core.learning.agreement import contradiction
@@ -113,6 +113,27 @@ def halves_warning(apart: float | None, remedy: str) -> str:
     return (
         'the two halves of the drive contradict each other, so that walls may be bent or doubled: odometry drifts or '
         f'jumps ({corrects}), the robot was carried, or many people or things moved'
+    )
+
+
+def jumps_warning(steps: Floats, jumped: Sequence[int], remedy: str) -> str:
+    """Return the warning about jumps of odometry in a map along it; '' without any.
+
+    Parameters
+    ----------
+    steps : float64, shape (M,)
+        Distances between poses, metres.
+    jumped : sequence of int
+        Which of them are jumps, in order.
+    remedy : str
+    """
+    if not len(jumped):
+        return ''
+    first = jumped[0]
+    often = 'once,' if len(jumped) == 1 else f'{len(jumped)} times, first'
+    return (
+        f'odometry jumps {often} by {steps[first]:.1f} m after {steps[:first].sum():.0f} m of driving: readings after '
+        f'the jump are mapped in a wrong place; {remedy}'
     )
 
 

@@ -25,6 +25,7 @@ from ..core.trajectory.correction import Correction
 from ..core.trajectory.jumps import MOST_JUMPS, jumps, may_jump
 from ..core.trajectory.refinable import SHORTEST
 from ..core.trajectory.windows import STILL, Odometry
+from ..files.quality_warning import jumps_warning
 from ..files.report_text import UNTESTED
 from ..files.trajectory_text import calibration_words
 from .background import Worker
@@ -78,16 +79,11 @@ class _Jump(NamedTuple):
 def jump_warnings(odometry: Odometry) -> list[str]:
     """Return a warning if odometry jumps, for maps along it; not if it seems to consist of jumps."""
     at = jumps(odometry)
-    if not 0 < len(at) <= MOST_JUMPS:
+    if len(at) > MOST_JUMPS:
         return []
-    first = int(at[0])
-    driven = float(np.hypot(*np.diff(odometry.pose[:first, :2], axis=0).T).sum())
-    far = math.dist(odometry.pose[first - 1, :2].tolist(), odometry.pose[first, :2].tolist())
-    often = 'once,' if len(at) == 1 else f'{len(at)} times, first'
-    return [
-        f'odometry jumps {often} by {far:.1f} m after {driven:.0f} m of driving: readings after the jump are mapped in '
-        'a wrong place; set refine_poses, which corrects this from the readings, or call reset after a jump'
-    ]
+    steps = np.hypot(*np.diff(odometry.pose[:, :2], axis=0).T)
+    remedy = 'set refine_poses, which corrects this from the readings, or call reset after a jump'
+    return list(filter(None, [jumps_warning(steps, (at - 1).tolist(), remedy)]))
 
 
 class Trajectory:

@@ -18,7 +18,7 @@ from ..core.messages.message_types import NANOSECONDS, Pose2
 from ..core.messages.pose_association import PoseAssociator
 from ..core.messages.robot_path import RobotPath
 from ..core.trajectory.jumps import FASTEST, too_far
-from ..files.quality_warning import thinned
+from ..files.quality_warning import jumps_warning, thinned
 
 MOST_JUMPED = 0.1
 """Fraction of steps that are jumps, from which the poses have a wrong unit, or are not those of a robot."""
@@ -197,16 +197,11 @@ def length_of(associator: PoseAssociator) -> float:
 def jumps_note(associator: PoseAssociator) -> list[str]:
     """Return a note if odometry jumps, for users who map without refinement; not if it seems to consist of jumps."""
     steps, jumped = _steps(associator)
-    count = int(np.count_nonzero(jumped))
-    if not 0 < count < MOST_JUMPED * len(steps):
+    at = np.flatnonzero(jumped).tolist()
+    if len(at) >= MOST_JUMPED * len(steps):
         return []
-    first = int(np.flatnonzero(jumped)[0])
-    often = 'once,' if count == 1 else f'{count} times, first'
-    return [
-        f'odometry jumps {often} by {steps[first]:.1f} m after {steps[:first].sum():.0f} m of driving: readings after '
-        'the jump are mapped in a wrong place; --refine-poses corrects this from the readings, or map only a part '
-        'with --start and --duration'
-    ]
+    remedy = '--refine-poses corrects this from the readings, or map only a part with --start and --duration'
+    return list(filter(None, [jumps_warning(steps, at, remedy)]))
 
 
 def alternation_note(associator: PoseAssociator) -> list[str]:

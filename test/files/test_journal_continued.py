@@ -232,11 +232,16 @@ def test_file_cut_before_it_was_whole_is_continued_as_well(tmp_path: Path) -> No
     assert newest(folder)[0] == list(range(len(back) + 10)) and whole(folder)
 
 
-def test_file_removed_before_it_was_copied_is_reported_once(tmp_path: Path) -> None:
+def after_an_unreadable_file(tmp_path: Path) -> tuple[Path, Journal]:
+    """Return a journal, and its folder, that continues an empty file in `drive_0002.journal`."""
     folder = tmp_path / 'j'
     folder.mkdir()
     (folder / 'drive_0001.journal').write_bytes(b'')
-    journal, _ = opened(folder)
+    return folder, opened(folder)[0]
+
+
+def test_file_removed_before_it_was_copied_is_reported_once(tmp_path: Path) -> None:
+    folder, journal = after_an_unreadable_file(tmp_path)
     written(journal, made(0, 10))
     journal.close()
     (folder / 'drive_0001.journal').unlink()
@@ -273,10 +278,7 @@ def test_file_removed_while_its_readings_are_only_in_memory_is_replaced(
 
 
 def test_reset_does_not_bring_back_the_continued_file(tmp_path: Path) -> None:
-    folder = tmp_path / 'j'
-    folder.mkdir()
-    (folder / 'drive_0001.journal').write_bytes(b'')
-    journal, _ = opened(folder)
+    folder, journal = after_an_unreadable_file(tmp_path)
     journal.begin_drive()
     written(journal, made(0, 10))
     journal.close()
@@ -287,10 +289,7 @@ def test_reset_does_not_bring_back_the_continued_file(tmp_path: Path) -> None:
 
 
 def test_deleted_file_is_replaced_by_one_that_continues_what_was_not_read(tmp_path: Path) -> None:
-    folder = tmp_path / 'j'
-    folder.mkdir()
-    (folder / 'drive_0001.journal').write_bytes(b'')
-    journal, _ = opened(folder)
+    folder, journal = after_an_unreadable_file(tmp_path)
     written(journal, made(500, 10))
     for path in folder.glob('drive_0002*'):
         path.unlink()
