@@ -475,8 +475,10 @@ def test_consistency_is_checked_again_when_the_readings_have_doubled(robot: EmRo
     assert checks() == 3
     robot.em.extrinsics = lambda: {'sonar': Pose2(0.2, 0.0, 0.0)}
     assert checks() == 4
-    robot.em.reset()
+    robot.trajectory.correction = object()
     assert checks() == 5
+    robot.em.reset()
+    assert checks() == 6
 
 
 def test_closing_cancels_the_run(held: EmRobot) -> None:
