@@ -2,69 +2,36 @@
 
 from __future__ import annotations
 
-import queue
-import threading
 import time
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import suppress
-from typing import Any, NamedTuple
+from typing import Any
 
-from ..core.common.errors import Cancelled
 from ..core.common.parameters import Parameters
-from ..core.common.readings import Readings
-from ..core.learning.consistency import consistency_warnings
 from ..core.maps.map_set import MapSet
 from ..core.messages.message_types import Pose2
 from ..core.messages.pose_association import PoseAssociator
-from ..core.messages.reading_buffer import bounded
-from ..core.trajectory.recovering import recovered, that_placed
-from ..core.trajectory.windows import Odometry
-from ..files.quality_warning import contradiction_of_halves, halves_warning, quality_warning
+from ..files.quality_warning import quality_warning
 from .background import Inbox, reason
+from .consistency_check import ConsistencyCheck
 from .deferred import Reply
 from .em import EmWorker, Outcome, Run, summary
 from .kernels import Kernels
 from .map_publishers import MapPublishers
 from .nothing_to_map import nothing_to_map
 from .online import OnlineWorker
-from .refining import Drive, Found, RefiningMapper
+from .refining import Found, RefiningMapper
+from .run_input import RunInput
 from .sensor_status import SensorWatch
 from .trajectory import Trajectory, jump_warnings
 
 LOG_PERIOD = 10.0
 """Seconds between two lines of progress in the log while the trajectory is estimated."""
 
-CHECKED_AGAIN = 2.0
-"""Factor by which the number of readings must grow before their consistency is checked again, which takes seconds."""
+REPLACED = 'the run that the node began by itself (refine_every) was replaced by run_em'
+"""The reason why such a run has no maps."""
 
 LONG_WAIT = 0.5
 """Seconds of waiting for kernels from which the answer mentions them."""
-
-
-class _Checked(NamedTuple):
-    """The warnings of the last check of consistency, and what was checked."""
-
-    readings: int
-    extrinsics: Mapping[str, Pose2]
-    parameters: Parameters
-    refined: bool
-    found: list[str]
-
-
-RunInput = tuple[int, Readings, Any]
-"""Number of readings accepted; those that are held; stamps and poses of odometry."""
-
-
-def _waited_for(taken: queue.SimpleQueue[RunInput | Exception], run: Run) -> RunInput:
-    """Return the input of a run from the executor, or raise its exception; stop waiting if the run is cancelled."""
-    while True:
-        if run.cancelled:
-            raise Cancelled('cancelled before it began')
-        with suppress(queue.Empty):
-            found = taken.get(timeout=0.1)
-            if isinstance(found, Exception):
-                raise found
-            return found
 
 
 def _fail_all(waiting: list[Callable[[Outcome], object]], why: str) -> None:
@@ -136,8 +103,8 @@ class EmService:
         self._inbox, self._kernels, self._logger = inbox, kernels, logger
         self._watched = self._logged = 0.0
         self._generation = 0
-        self._checked: _Checked | None = None
         self.worker = EmWorker(self._watch, logger.error, inbox.put, self._wait_for_kernels)
+        self._consistency = ConsistencyCheck(self.worker.worker, inbox)
 
     @property
     def current(self) -> Run | None:
@@ -247,7 +214,7 @@ class EmService:
         self.maps, self.found, self.last_run = None, None, 'none since the reset'
         self.wrong_input, self.drive_faults = [], []
         self.sensors.clear()
-        self._checked = None
+        self._consistency.forget()
 
     def close(self, seconds: float) -> None:
         """Cancel the current run, and wait at most so many seconds for its end."""
@@ -255,34 +222,14 @@ class EmService:
 
     def _start(self, *callers: Callable[[Outcome], object]) -> Run:
         """Begin a run, and have callers called with its outcome."""
-        generation, bound = self._publishers.generation, self._associator.buffer.bound
-        # readings that arrive while kernels are compiled are mapped as well
-        early = not all(map(self._kernels.has, self._needed()))
-        taken, begun = [self._take()], threading.Event()
-
-        def take_now() -> RunInput:
-            answer = queue.SimpleQueue[RunInput | Exception]()
-
-            def take() -> None:
-                try:
-                    answer.put(self._take())
-                except Exception as error:
-                    # otherwise the run would wait for ever
-                    answer.put(error)
-
-            self._inbox.put(take)
-            return _waited_for(answer, run)
-
-        def readings() -> Readings:
-            begun.set()
-            if early:
-                taken[0] = take_now()
-            return bounded(taken[0][1], bound)
+        generation, parameters = self._publishers.generation, self._parameters()
+        compiled = all(map(self._kernels.has, self._needed()))
+        data = RunInput(self._associator, self._inbox, self.mounts(), compiled, lambda: run.cancelled)
 
         def found(maps: MapSet) -> None:
             if isinstance(mapper, RefiningMapper) or moved:
                 # the transform from the map frame changes together with the maps
-                self._inbox.put(lambda: self._show_moved(run, maps, taken[0][0], generation))
+                self._inbox.put(lambda: self._show_moved(run, maps, data.accepted, generation))
             else:
                 self._show(maps, generation)
 
@@ -290,54 +237,31 @@ class EmService:
             # all callers get the same outcome
             if generation != self._publishers.generation:
                 outcome.maps, outcome.message = None, 'EM was cancelled by reset'
-            elif outcome.maps is None and run.end_requested:
-                outcome.message = 'EM was cancelled by cancel_em'
-            elif outcome.maps is None and not len(taken[0][1]):
-                lack = self.no_map_frame()
-                outcome.message = nothing_to_map(self._associator, self.range_topics, self.odom_topic, lack)
-            elif outcome.maps is None and run.then:
-                outcome.message = 'the run that the node began by itself (refine_every) was replaced by run_em'
-                outcome.replaced = True
-            self._finish(outcome, taken[0][0])
-            if outcome.maps is None and run.shown:
+            elif outcome.maps is None:
+                why = self._why_no_maps(run, data)
+                outcome.message, outcome.replaced = why or outcome.message, why == REPLACED
+            if outcome.maps is not None:
+                self._keep(outcome, outcome.maps, data.accepted)
+                return
+            self._report_failure(outcome)
+            if run.shown:
                 self._publishers.publish('ml_map', generation, *before)
-
-        parameters = self._parameters()
-        mounts, jumped = dict(self.mounts()), self._associator.time_jumps > 0
-
-        def fresh() -> bool:
-            waits = early and not begun.is_set()
-            return parameters is self._parameters() and (waits or taken[0][0] == len(self._associator.buffer))
-
-        def drive() -> Drive:
-            _, held, odometry = taken[0]
-            known = Odometry.of(*odometry)
-            # after a restart, readings of the journal are the only record of the odometry before it; but after a jump
-            # back of the clock, the times of both overlap
-            return Drive(that_placed(held, known, mounts) if jumped else recovered(known, held, mounts), held)
-
-        def now() -> Drive:
-            _, held, odometry = take_now()
-            return Drive(Odometry.of(*odometry), held)
 
         def inspect() -> list[str]:
             # with a refined trajectory, its own words say what became of jumps
             refined = isinstance(mapper, RefiningMapper) and mapper.found and mapper.found.refinement
-            return [] if refined else jump_warnings(Odometry(*taken[0][2]))
+            return [] if refined else jump_warnings(data.odometry)
 
-        mapper, moved = self._trajectory.mapper(parameters, drive, now), self._trajectory.on
+        mapper, moved = self._trajectory.mapper(parameters, data.drive, data.drive_so_far), self._trajectory.on
         start = self.online.so_far() if self.online and self._trajectory.correction is None else None
         # intermediate maps are shown meanwhile; if the run ends without a map, this one is published again
         before = self._publishers.ml_map
-        run = Run(mapper, parameters, readings, found, start, fresh=fresh, inspect=inspect)
+        run = Run(mapper, parameters, data.readings, found, start, inspect=inspect)
+        run.fresh = lambda: data.fresh and parameters is self._parameters()
         self._generation = generation
         self.worker.start(run, finish)
         run.waiting.extend(callers)
         return run
-
-    def _take(self) -> RunInput:
-        buffer = self._associator.buffer
-        return len(buffer), buffer.snapshot(), self._associator.odometry
 
     def _show(self, maps: MapSet, generation: int) -> None:
         """Publish the maps of a run; may be called from any thread."""
@@ -359,17 +283,25 @@ class EmService:
         for step in self._needed():
             self._kernels.wait(step, stop)
 
-    def _finish(self, outcome: Outcome, count: int) -> None:
-        maps = outcome.maps
-        if maps is None:
-            self.last_run = outcome.message
-            text = outcome.message if outcome.message.startswith('EM ') else f'EM: {outcome.message}'
-            # a call that replaces a run of the node itself is no fault
-            (self._logger.info if outcome.replaced else self._logger.warning)(text)
-            if self.online:
-                # maps that it made during EM were not published
-                self.online.show()
-            return
+    def _why_no_maps(self, run: Run, data: RunInput) -> str:
+        """Return the reason why a run ended without maps, if the run itself cannot know it; otherwise ''."""
+        if run.end_requested:
+            return 'EM was cancelled by cancel_em'
+        if data.empty:
+            return nothing_to_map(self._associator, self.range_topics, self.odom_topic, self.no_map_frame())
+        return REPLACED if run.then else ''
+
+    def _report_failure(self, outcome: Outcome) -> None:
+        self.last_run = outcome.message
+        text = outcome.message if outcome.message.startswith('EM ') else f'EM: {outcome.message}'
+        # a call that replaces a run of the node itself is no fault
+        (self._logger.info if outcome.replaced else self._logger.warning)(text)
+        if self.online:
+            # maps that it made during EM were not published
+            self.online.show()
+
+    def _keep(self, outcome: Outcome, maps: MapSet, count: int) -> None:
+        """Keep the maps of a run, log its result, and begin the checks that take longer."""
         self.maps, self.found, self.explained = maps, self._trajectory.found, count
         outcome.warnings += self.clock_notes()
         self.wrong_input, self.drive_faults = outcome.warnings, outcome.drive
@@ -383,29 +315,16 @@ class EmService:
         self.last_run = '; '.join(said)
         self._logger.info(f'EM: {self.last_run}')
         # callers of EM are answered before this
-        fixed, generation, last = dict(self.extrinsics()), self._publishers.generation, self._checked
         refined = self._trajectory.correction is not None
-        known = last and last[1:4] == (fixed, maps.parameters, refined)
-        if last and known and len(maps.readings) < CHECKED_AGAIN * last.readings:
-            self.wrong_input = [*self.wrong_input, *last.found]
-        else:
-            self.worker.worker.put(lambda: self._check_consistency(maps, fixed, refined, generation))
+        self._add_faults(self._consistency.warnings(maps, dict(self.extrinsics()), refined, self._warn))
 
-    def _check_consistency(self, maps: MapSet, fixed: Mapping[str, Pose2], refined: bool, generation: int) -> None:
-        """Look for sensor poses, clock offsets and odometry that contradict the readings; in the worker's thread."""
-        found = consistency_warnings(maps.readings, fixed, maps.parameters)
-        if not refined:
-            remedy = '' if maps.parameters.node.refine_poses else 'refine_poses'
-            found += filter(None, [halves_warning(contradiction_of_halves(maps), remedy)])
+    def _warn(self, found: list[str]) -> None:
+        self._add_faults(found)
+        for warning in found:
+            self._logger.warning(f'EM: {warning}')
 
-        def take() -> None:
-            if generation == self._publishers.generation and maps is self.maps:
-                self._checked = _Checked(len(maps.readings), fixed, maps.parameters, refined, found)
-                self.wrong_input = [*self.wrong_input, *found]
-                for warning in found:
-                    self._logger.warning(f'EM: {warning}')
-
-        self._inbox.put(take)
+    def _add_faults(self, found: list[str]) -> None:
+        self.wrong_input = [*self.wrong_input, *found]
 
     def _watch(self, run: Run) -> None:
         """Log progress and publish the map found so far, at most `publish_rate` times a second; in the run's thread."""

@@ -104,28 +104,43 @@ class MapperNode(ManagedNode):
             If a parameter is not valid for the system, or the journal cannot be opened.
         """
         self._begin_anew()
+        ranges, odometry = self._topics()
+        self._make_frames()
+        self._make_maps()
+        self._make_em(ranges, odometry)
+        self._make_intake()
+        self._offer_services()
+        self._begin()
+
+    def _topics(self) -> tuple[list[str], str]:
+        """Return the full names of the topics of Range and odometry."""
         node, log = self.parameters.node, self.get_logger()
         odometry = self._resolved('odom_topic', node.odom_topic)
         ranges = [self._resolved('range_topics', topic) for topic in node.range_topics]
-        if why := unwritable(node.save_directory):
-            log.warning(f'save_maps will fail: {why}; set save_directory to a folder that can be written')
         for topic in {topic for topic in ranges if ranges.count(topic) > 1}:
             log.warning(f'range_topics has {topic} {ranges.count(topic)} times; its readings are used once')
-        ranges = list(dict.fromkeys(ranges))
-        if not node.range_topics:
+        if not ranges:
             raise MapperError('range_topics is empty; set it to one or more topics of sensor_msgs/Range')
         if odometry in ranges:
             raise MapperError(
                 f'{odometry} cannot be a topic of both Range and odometry: set range_topics or odom_topic'
             )
-        transforms = Transforms.of(self)
-        extrinsics = Extrinsics(ros_parameters.mounts(self), transforms)
+        return list(dict.fromkeys(ranges)), odometry
+
+    def _make_frames(self) -> None:
+        node, transforms = self.parameters.node, Transforms.of(self)
         # with refine_poses this node publishes the transform
         looked_up = '' if node.refine_poses else node.map_frame
-        self._map_frame = MapFrame(looked_up, transforms, self.parameters.association.pose_timeout)
         if looked_up and not transforms.available:
             raise MapperError(f'map_frame is {node.map_frame}, but tf2_ros is not installed to look it up')
-        self.associator = PoseAssociator(extrinsics, self.parameters, at_once=AT_ONCE)
+        self._transforms, self._extrinsics = transforms, Extrinsics(ros_parameters.mounts(self), transforms)
+        self._map_frame = MapFrame(looked_up, transforms, self.parameters.association.pose_timeout)
+        self._poses_from = 'parameters and TF' if transforms.available else 'parameters (tf2_ros is not installed)'
+
+    def _make_maps(self) -> None:
+        """Make what maps each reading: the associator, the trajectory and the maps that are always up to date."""
+        node, log = self.parameters.node, self.get_logger()
+        self.associator = PoseAssociator(self._extrinsics, self.parameters, at_once=AT_ONCE)
         inbox = self.inbox = Inbox(self)
         kernels = self.kernels = Kernels(log.info, log.error, node.online, node.refine_poses)
         self.trajectory = trajectory = Trajectory(self, self.associator, self._steady)
@@ -141,39 +156,52 @@ class MapperNode(ManagedNode):
         self._ends += [feed.close, kernels.release]
         trajectory.changed = feed.replace
         self.live, self.online = feed.live, feed.online
-        self.em = EmService(lambda: self.parameters, self.associator, trajectory, self.maps, inbox, kernels, log)
-        self._ends.append(partial(self.em.close, 2.0))
+
+    def _make_em(self, ranges: list[str], odometry: str) -> None:
+        log, trajectory, extrinsics = self.get_logger(), self.trajectory, self._extrinsics
+        em = self.em = EmService(
+            lambda: self.parameters, self.associator, trajectory, self.maps, self.inbox, self.kernels, log
+        )
+        self._ends.append(partial(em.close, 2.0))
         # during EM, its intermediate maps are shown
-        feed.shows_online = lambda: self.em.current is None
-        trajectory.refine = lambda: self.mapping and self.em.run_by_itself()
-        self._extrinsics = extrinsics
-        self.em.range_topics, self.em.odom_topic = ranges, odometry
-        self.em.no_map_frame = lambda: self._map_frame.lack
-        self.em.extrinsics, self.em.mounts = lambda: extrinsics.fixed, lambda: extrinsics.known
-        self.em.online = self.online
-        self.saver = Saver(self.em, self.live, self._account, log)
-        self._readings_worker = Worker('readings', log.error)
+        self.feed.shows_online = lambda: em.current is None
+        trajectory.refine = lambda: self.mapping and em.run_by_itself()
+        em.range_topics, em.odom_topic = ranges, odometry
+        em.no_map_frame = lambda: self._map_frame.lack
+        em.extrinsics, em.mounts = lambda: extrinsics.fixed, lambda: extrinsics.known
+        em.online = self.online
+        folder = self.parameters.node.save_directory
+        if why := unwritable(folder):
+            log.warning(f'save_maps will fail: {why}; set save_directory to a folder that can be written')
+        self.saver = Saver(em, self.live, self._account, log)
+
+    def _make_intake(self) -> None:
+        """Make what receives readings and keeps them, and the reporter, which watches all parts."""
+        following = self.trajectory.following
+        self._readings_worker = Worker('readings', self.get_logger().error)
         self._ends += [partial(worker.close, 0.5) for worker in (self.saver.worker, self._readings_worker)]
-        self.journal = JournalKeeper(self, node.journal, self.associator)
+        self.journal = JournalKeeper(self, self.parameters.node.journal, self.associator)
         self.workers = [self._readings_worker, self.live.worker, self.maps.worker, self.em.worker.worker]
-        self.workers += [part.worker for part in (self.saver, self.online, trajectory.following, kernels) if part]
+        self.workers += [part.worker for part in (self.saver, self.online, following, self.kernels) if part]
         health = Health()
         self.intake = Intake(self, self.parameters, self.associator, self._map_frame, health.taken)
         self.em.clock_notes = self.intake.clock_notes
-        trajectory.listening = lambda: self.intake.listening
+        self.trajectory.listening = lambda: self.intake.listening
         self.reporter = Reporter(
             self,
             health,
             self.intake,
             self.associator,
-            (extrinsics, self._map_frame, transforms),
+            (self._extrinsics, self._map_frame, self._transforms),
             self.live,
             self.em,
             self.journal,
             self.trajectory,
-            kernels,
+            self.kernels,
             self.workers,
         )
+
+    def _offer_services(self) -> None:
         for name, handler in (
             ('~/run_em', self.em.run_em),
             ('~/cancel_em', self.em.cancel),
@@ -183,17 +211,21 @@ class MapperNode(ManagedNode):
             self._calls.append(DeferredService(self, Trigger, name, partial(self._answer_when_ready, handler)))
         self._calls += [DeferredService(self, SetBool, '~/pause', self.pause), *self.maps.services]
         self.create_timer(1.0, self.reporter.report, clock=self._steady)
-        self._live_timer = self.create_timer(1.0 / node.publish_rate, self.publish_live, clock=self._steady)
+        rate = self.parameters.node.publish_rate
+        self._live_timer = self.create_timer(1.0 / rate, self.publish_live, clock=self._steady)
+
+    def _begin(self) -> None:
+        """Restore the journal, and compile, in the background."""
+        inbox, before_thinning = self.inbox, self.associator.buffer.before_thinning
         # a journal that is still being read must not add readings to the next configuration
-        self._ends.append(self.associator.buffer.before_thinning.clear)
+        self._ends.append(before_thinning.clear)
         # closed first, since other work may take as long as `stopping.GRACE`
         self._ends.append(self.journal.close)
         self.journal.open()
         self._started = True
-        self._poses_from = 'parameters and TF' if transforms.available else 'parameters (tf2_ros is not installed)'
         # the live map contains every reading, also those that max_readings removes
-        self.associator.buffer.before_thinning.append(feed.feed)
-        kernels.begin(lambda: inbox.put(lambda: self._step_done('kernels')))
+        before_thinning.append(self.feed.feed)
+        self.kernels.begin(lambda: inbox.put(lambda: self._step_done('kernels')))
         self._readings_worker.put(
             partial(self._restore, self.journal, inbox), lambda why: inbox.put(lambda: self._fail(why))
         )

@@ -19,7 +19,7 @@ from forward_grid_mapper.core.common.readings import Readings
 from forward_grid_mapper.core.messages.message_types import Pose2
 from forward_grid_mapper.core.messages.pose_association import PoseAssociator
 from forward_grid_mapper.core.search.search import Progress
-from forward_grid_mapper.node import em, em_service
+from forward_grid_mapper.node import consistency_check, em, em_service
 from forward_grid_mapper.node.background import Inbox
 from forward_grid_mapper.node.em import Outcome
 from forward_grid_mapper.node.em_service import EmService
@@ -138,8 +138,8 @@ class EmRobot:
             em_service, 'summary', lambda maps, seconds: f'{len(maps.readings)} readings in {seconds:.2f} s'
         )
         self.checked: list[tuple[int, Any]] = []
-        monkeypatch.setattr(em_service, 'consistency_warnings', self._check)
-        monkeypatch.setattr(em_service, 'contradiction_of_halves', lambda maps: self.halves)
+        monkeypatch.setattr(consistency_check, 'consistency_warnings', self._check)
+        monkeypatch.setattr(consistency_check, 'contradiction_of_halves', lambda maps: self.halves)
         self.em = EmService(
             lambda: self.parameters,
             self.associator,

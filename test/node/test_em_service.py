@@ -18,7 +18,7 @@ from em_robot import BEFORE, GRID, PROGRESS, SO_FAR, EmRobot
 from forward_grid_mapper.core.common.errors import InputError
 from forward_grid_mapper.core.common.parameters import Parameters
 from forward_grid_mapper.core.messages.message_types import OdometryMessage, Pose2
-from forward_grid_mapper.node import em_service
+from forward_grid_mapper.node import consistency_check, em_service
 
 
 @pytest.fixture
@@ -407,18 +407,18 @@ def test_contradictions_are_checked_after_the_response_and_logged(robot: EmRobot
     assert robot.checked == [(5, {'sonar': (0.1, 0.0, 0.0)})]
     assert robot.em.wrong_input == ['copies', 'stamps are late', 'mirrored']
     assert robot.node.warned[-2:] == ['EM: stamps are late', 'EM: mirrored']
-    # nothing is logged about deleted maps, or about maps that have been replaced
-    robot.node.warned.clear()
-    for forget in ('maps', 'generation'):
-        robot.em._check_consistency(robot.em.maps, {}, False, 3)  # type: ignore[arg-type]
-        if forget == 'maps':
-            kept, robot.em.maps = robot.em.maps, None
-        else:
-            robot.publishers.generation += 1
-        robot.node.turn()
-        robot.em.maps = kept
-        robot.publishers.generation = 3
-    assert robot.node.warned == [] and len(robot.em.wrong_input) == 3
+
+
+def test_contradictions_of_deleted_maps_are_not_logged(robot: EmRobot, monkeypatch: pytest.MonkeyPatch) -> None:
+    def reset_meanwhile(*given: Any) -> list[str]:
+        robot.inbox.put(robot.em.reset)
+        return ['mirrored']
+
+    monkeypatch.setattr(consistency_check, 'consistency_warnings', reset_meanwhile)
+    robot.run_em()
+    robot.settle()
+    assert robot.em.maps is None and robot.em.wrong_input == []
+    assert 'EM: mirrored' not in robot.node.warned
 
 
 def test_halves_that_contradict_each_other_give_a_warning(robot: EmRobot) -> None:

@@ -25,8 +25,9 @@ from forward_grid_mapper.core.messages import reading_buffer
 from forward_grid_mapper.core.messages.reading_buffer import ReadingBuffer
 from forward_grid_mapper.core.online_map import OnlineMap
 from forward_grid_mapper.core.trajectory.following import Follower
-from forward_grid_mapper.node import em, em_service, main, map_publishers, saver
+from forward_grid_mapper.node import consistency_check, em, main, map_publishers, saver
 from forward_grid_mapper.node.intake import AT_ONCE
+from forward_grid_mapper.node.run_input import RunInput
 
 OK, WARN = b'\x00', b'\x01'
 
@@ -36,7 +37,7 @@ LONG_WORK: tuple[tuple[Any, str], ...] = (
     *((Mapper, name) for name in ('run', 'so_far')),
     *((reading_buffer, name) for name in ('kept', 'bounded')),
     *((em, name) for name in ('sensor_health', 'input_warnings', 'map_grid')),
-    (em_service, 'consistency_warnings'),
+    (consistency_check, 'consistency_warnings'),
     (Follower, 'follow'),
     (map_publishers, 'grid_message'),
     (saver, 'write_results'),
@@ -104,7 +105,7 @@ def test_contradictory_poses_are_reported_after_the_response(
         assert go_on.wait(60.0)
         return ['stamps are late']
 
-    monkeypatch.setattr(em_service, 'consistency_warnings', contradiction)
+    monkeypatch.setattr(consistency_check, 'consistency_warnings', contradiction)
     robot = inside().start()
     node = robot.node
     robot.drive(0, 60)
@@ -153,14 +154,14 @@ def test_em_fails_if_newer_readings_do_not_fit_into_memory(
     node = robot.node
     robot.drive(0, 20)
     monkeypatch.setattr(node.kernels, 'has', lambda name: False)
-    taken, take = iter([True]), node.em._take
+    taken, take = iter([True]), RunInput._take
 
-    def once() -> Any:
+    def once(data: RunInput) -> Any:
         if next(taken, False):
-            return take()
+            return take(data)
         raise MemoryError
 
-    monkeypatch.setattr(node.em, '_take', once)
+    monkeypatch.setattr(RunInput, '_take', once)
     success, message = robot.call(node.em.run_em)
     assert not success and 'does not fit into the memory' in message
 
