@@ -7,6 +7,7 @@ direction have echoes from beyond.
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
@@ -38,6 +39,9 @@ SLANT = np.radians(30.0)
 MARGIN = 0.3
 """Metres within which the range of a reading ends at the place; longer ones pass it."""
 
+FAR = 3
+"""Squares to each side of the one with the most echoes that the local mean, and the place around it, may touch."""
+
 NAMED = 3
 
 
@@ -60,22 +64,46 @@ def changes(maps: MapSet, drives: int) -> list[Change]:
 def _of(maps: MapSet, number: int) -> Iterator[Change]:
     """Yield the places at which one drive has an object and the others have none."""
     readings = maps.readings
-    end = np.stack([readings.x + readings.z * np.cos(readings.yaw), readings.y + readings.z * np.sin(readings.yaw)], 1)
+    end = _ends(readings)
     row, column = maps.grid.cells_of(end[:, 0], end[:, 1])
     inside = (row >= 0) & (row < maps.grid.height) & (column >= 0) & (column < maps.grid.width)
-    odd = maps.unexplained & readings.echo & (readings.drive == number) & inside
+    mine = readings.drive == number
+    odd = maps.unexplained & readings.echo & mine & inside
     odd[odd] = maps.ml[row[odd], column[odd]] == 0
-    remaining = end[odd]
-    # the densest place first, and then the remaining echoes
-    while len(remaining) >= UNEXPLAINED:
-        bins, counts = np.unique(np.floor(remaining / EDGE), axis=0, return_counts=True)
-        if counts.max() < UNEXPLAINED / 2:
-            return
-        place = _densest(remaining, (bins[counts.argmax()] + 0.5) * EDGE)
-        change = _change_at(readings, number, place)
+    if np.count_nonzero(odd) < UNEXPLAINED:
+        return
+    own, others = (_Echoes(readings.select(readings.echo & each)) for each in (mine, ~mine))
+    for place in _places(end[odd]):
+        change = _change_at(own, others, number, place)
         if change is not None:
             yield change
-        remaining = remaining[(np.abs(remaining - place) > EDGE).any(axis=1)]
+
+
+def _ends(readings: Readings) -> NDArray[np.float64]:
+    """Return the point at the range of each reading on its axis, shape (N, 2), metres."""
+    x, y = readings.x + readings.z * np.cos(readings.yaw), readings.y + readings.z * np.sin(readings.yaw)
+    return np.stack([x, y], axis=1)
+
+
+def _places(points: NDArray[np.float64]) -> Iterator[NDArray[np.float64]]:
+    """Yield the places with the most points, each without the points of the places before it."""
+    # a long drive has thousands of places, so each looks only at the squares around it
+    squares, of, counts = np.unique(np.floor(points / EDGE), axis=0, return_inverse=True, return_counts=True)
+    of = of.ravel()
+    number = {(x, y): k for k, (x, y) in enumerate(squares.tolist())}
+    of_square = np.split(np.argsort(of, kind='stable'), np.cumsum(counts)[:-1])
+    left, remaining = np.ones(len(points), np.bool_), len(points)
+    while remaining >= UNEXPLAINED and counts.max() >= UNEXPLAINED / 2:
+        x, y = squares[counts.argmax()].tolist()
+        around = itertools.product(np.arange(x - FAR, x + FAR + 1), np.arange(y - FAR, y + FAR + 1))
+        near = np.sort(np.concatenate([of_square[number[each]] for each in around if each in number]))
+        near = near[left[near]]
+        place = _densest(points[near], np.array([x + 0.5, y + 0.5]) * EDGE)
+        yield place
+        gone = near[(np.abs(points[near] - place) <= EDGE).all(axis=1)]
+        left[gone] = False
+        np.subtract.at(counts, of[gone], 1)
+        remaining -= len(gone)
 
 
 def _densest(points: NDArray[np.float64], place: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -86,23 +114,46 @@ def _densest(points: NDArray[np.float64], place: NDArray[np.float64]) -> NDArray
     return place
 
 
-def _change_at(readings: Readings, number: int, place: NDArray[np.float64]) -> Change | None:
-    """Return the change at a place; None if there is none."""
-    away = place - np.stack([readings.x, readings.y], axis=1)
-    axis = np.stack([np.cos(readings.yaw), np.sin(readings.yaw)], axis=1)
-    along, beside = (away * axis).sum(axis=1), np.abs(away[:, 0] * axis[:, 1] - away[:, 1] * axis[:, 0])
-    towards = readings.echo & (along > 0) & (beside <= BESIDE)
-    ends = towards & (np.abs(readings.z - along) <= MARGIN)
-    goes_on = towards & (readings.z > along + MARGIN)
-    own = readings.drive == number
-    echoes = int((ends & own).sum())
-    if echoes < ENOUGH or (goes_on & own).sum() > AGAINST * echoes:
+class _Echoes:
+    """Readings with an echo, of which those near a place are found without a look at all."""
+
+    def __init__(self, readings: Readings) -> None:
+        r = readings.select(np.argsort(readings.x, kind='stable'))
+        self._rows = np.stack([r.x, r.y, np.cos(r.yaw), np.sin(r.yaw), r.z, r.yaw])
+        # from farther away, no axis ends at a place or passes it
+        self._reach = float(readings.z.max(initial=0.0)) + MARGIN
+
+    def at(self, place: NDArray[np.float64]) -> _Towards:
+        """Return the readings near a place, with those whose axis leads to it."""
+        x, y = place.tolist()
+        first, last = np.searchsorted(self._rows[0], [x - self._reach, x + self._reach]).tolist()
+        rows = self._rows[:, first:last]
+        px, py, ax, ay, z, yaw = rows[:, np.abs(rows[1] - y) <= self._reach]
+        along, beside = (x - px) * ax + (y - py) * ay, np.abs((x - px) * ay - (y - py) * ax)
+        towards = (along > 0) & (beside <= BESIDE)
+        return _Towards(yaw, towards & (np.abs(z - along) <= MARGIN), towards & (z > along + MARGIN))
+
+
+class _Towards(NamedTuple):
+    """Yaws of some readings, radians, and which of them end at a place, and which go on beyond it; shape (N,)."""
+
+    yaw: NDArray[np.float64]
+    ends: NDArray[np.bool_]
+    goes_on: NDArray[np.bool_]
+
+
+def _change_at(own: _Echoes, others: _Echoes, number: int, place: NDArray[np.float64]) -> Change | None:
+    """Return the change at a place between one drive, `number`, and the others; None if there is none."""
+    yaw, ends, goes_on = own.at(place)
+    echoes = int(ends.sum())
+    if echoes < ENOUGH or goes_on.sum() > AGAINST * echoes:
         return None
     # directions are modulo a half turn
-    direction = np.angle(np.exp(2j * readings.yaw[ends & own]).sum()) / 2
-    alike = np.abs(np.angle(np.exp(2j * (readings.yaw - direction)))) / 2 <= SLANT
-    passed = int((goes_on & alike & ~own).sum())
-    if passed < PASSED or (ends & alike & ~own).sum() > SHARE * passed:
+    direction = np.angle(np.exp(2j * yaw[ends]).sum()) / 2
+    yaw, ends, goes_on = others.at(place)
+    alike = np.abs(np.angle(np.exp(2j * (yaw - direction)))) / 2 <= SLANT
+    passed = int((goes_on & alike).sum())
+    if passed < PASSED or (ends & alike).sum() > SHARE * passed:
         return None
     return Change(number, float(place[0]), float(place[1]), echoes, passed)
 

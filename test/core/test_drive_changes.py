@@ -8,10 +8,13 @@ from functools import cache
 import numpy as np
 import pytest
 
+from forward_grid_mapper.core import drive_changes
+from forward_grid_mapper.core.common.grid import Grid
 from forward_grid_mapper.core.common.parameters import Parameters
 from forward_grid_mapper.core.common.readings import Readings, of_drives
 from forward_grid_mapper.core.drive_changes import change_warnings, changes
 from forward_grid_mapper.core.mapping import Mapper
+from forward_grid_mapper.core.maps.map_set import MapSet
 from forward_grid_mapper.simulation.drive import corridor_drive, drive
 from forward_grid_mapper.simulation.sonar import NOISY, front_array, sonar_ring
 from forward_grid_mapper.simulation.world import World, rooms_world
@@ -66,3 +69,36 @@ def test_person_behind_the_robot_is_no_change() -> None:
 def test_single_drive_has_no_changes() -> None:
     maps = Mapper(Parameters()).run(driven(True, THROUGH, 0))
     assert change_warnings(maps, ['monday']) == [] == changes(maps, 1)
+
+
+def test_each_place_of_a_long_drive_looks_only_at_its_surroundings(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Two drives through a large hall with many random echoes, and a box in it during the second one."""
+    rng, count, size = np.random.default_rng(5), 20_000, 40.0
+    x, y = rng.uniform(0.0, size, (2, count))
+    yaw, z = rng.uniform(-np.pi, np.pi, count), rng.uniform(0.3, 3.0, count)
+    box = np.arange(count) < 40
+    x[box], y[box], yaw[box], z[box] = rng.uniform(18.0, 19.0, 40), 20.0, 0.0, 5.0
+    z[:20] = 20.3 - x[:20]
+    drive = np.where(np.arange(count) < 20, 1, np.arange(count) % 2 * ~box).astype(np.int32)
+    readings = Readings.from_columns(
+        ('sonar',), x=x, y=y, yaw=yaw, z=z, z_max=6.0, half_angle=0.13, stamp=np.arange(count), drive=drive
+    )
+    grid = Grid(0.1, 0, 0, 400, 400)
+    free, none = np.zeros(grid.shape, np.int8), np.zeros(grid.shape, np.float32)
+    random = np.arange(count) % 2 == 0
+    random[box] = drive[box] == 1
+    maps = MapSet(grid, none, free, none, readings, random, 0.0, 0.0, Parameters())
+    sizes: list[int] = []
+    densest = drive_changes._densest
+
+    def counting(points: np.ndarray, place: np.ndarray) -> np.ndarray:
+        sizes.append(len(points))
+        return densest(points, place)
+
+    monkeypatch.setattr(drive_changes, '_densest', counting)
+    (found,) = changes(maps, 2)
+    assert found.drive == 1
+    assert min(found.echoes, found.passed) >= 20
+    assert abs(found.x - 20.3) < 0.3 and abs(found.y - 20.0) < 0.3
+    assert len(sizes) > 500, 'places'
+    assert max(sizes) < 500, 'of ten thousand points'

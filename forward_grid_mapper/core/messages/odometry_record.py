@@ -68,6 +68,8 @@ class OdometryRecord:
     def clear(self) -> None:
         """Remove all poses."""
         self._size, self._next, self._anew = 0, 0, False
+        # number of rows that snapshots may show
+        self._shown = 0
         self.late = 0
         self._before = np.iinfo(np.int64).min
         self._late: dict[int, Pose2] = {}
@@ -108,7 +110,10 @@ class OdometryRecord:
         self._late.pop(stamp, None)
         if self._size and self._stamp[self._size - 1] == stamp:
             self._size -= 1
-            self._stamp, self._pose = self._stamp[: self._size].copy(), self._pose[: self._size].copy()
+            # a copy only for a snapshot: if two clocks alternate, every second pose is removed
+            if self._size < self._shown:
+                self._stamp, self._pose = self._stamp[: self._size].copy(), self._pose[: self._size].copy()
+                self._shown = 0
         if self._before == stamp:
             self._before = int(self._stamp[self._size - 1]) if self._size else np.iinfo(np.int64).min
 
@@ -145,6 +150,7 @@ class OdometryRecord:
             Stamp of the first reading of the drive, ns: after `begin_anew`, poses begin with the last one before it.
         """
         self._sort_in()
+        self._shown = max(self._shown, self._size)
         stamp, pose = self._stamp[: self._size], self._pose[: self._size]
         if not self._anew or first is None:
             return stamp, pose
@@ -154,6 +160,7 @@ class OdometryRecord:
     def since(self, stamp: int) -> tuple[NDArray[np.int64], Floats]:
         """Return stamps and poses from a stamp on, like `snapshot`, without late ones that are not yet sorted in."""
         begin = int(np.searchsorted(self._stamp[: self._size], stamp))
+        self._shown = max(self._shown, self._size)
         return self._stamp[begin : self._size], self._pose[begin : self._size]
 
     def _sort_in(self) -> None:

@@ -66,6 +66,26 @@ def test_message_that_is_sent_again_changes_nothing() -> None:
     assert record.snapshot()[1][-1].tolist() == list(other)
 
 
+def test_removing_the_newest_pose_copies_nothing_unless_a_snapshot_shows_it() -> None:
+    """As if two nodes publish odometry by clocks that differ: each second pose is ahead, and is removed."""
+    record = hours_of_odometry()
+    stamp, before = record.snapshot()
+    held = before.copy()
+    record.drop(int(stamp[-1]))
+    record.add(int(stamp[-1]) + 5, Pose2(-1.0, 0.0, 0.0))
+    assert np.array_equal(before, held)
+    columns = record._pose
+    for k in range(10):
+        record.add(10**9, Pose2(-2.0, 0.0, 0.0))
+        record.drop(10**9)
+        record.add(int(stamp[-1]) + 10 + k, Pose2(-3.0, 0.0, k))
+    assert record._pose is columns, 'a copy each time would take minutes for an hour of such odometry'
+    now, poses = record.snapshot()
+    assert now[-12:].tolist() == [stamp[-2], *(stamp[-1] + k for k in (5, *range(10, 20)))]
+    assert poses[-11:, 0].tolist() == [-1.0, *10 * [-3.0]]
+    assert np.array_equal(before, held)
+
+
 def test_sorting_in_late_poses_looks_at_the_last_poses_only(monkeypatch: pytest.MonkeyPatch) -> None:
     record = hours_of_odometry()
     sizes: list[int] = []
