@@ -93,9 +93,18 @@ class DeferredService:
         reply.arrived(header)
 
     def end(self, why: str) -> None:
-        """Answer all open calls with a failure and its reason."""
+        """Answer all calls with a failure and its reason, also those in the middleware; called by the executor.
+
+        The middleware drops the latter when the service is destroyed, and their clients would wait for ever.
+        """
         for reply in list(self.open):
             reply.fail(why)
+        handle = self._service.handle
+        with handle:
+            while (header := (taken := handle.service_take_request(self.kind.Request))[1]) is not None:
+                reply = Reply(self, taken[0])
+                reply.fail(why)
+                reply.arrived(header)
 
     def transmit(self, response: Any, header: Any) -> None:
         """Send a response to the client; may be called from any thread."""

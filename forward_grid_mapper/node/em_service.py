@@ -30,6 +30,8 @@ LOG_PERIOD = 10.0
 REPLACED = 'the run that the node began by itself (refine_every) was replaced by run_em'
 """The reason why such a run has no maps."""
 
+BY_RESET = 'EM was cancelled by reset'
+
 LONG_WAIT = 0.5
 """Seconds of waiting for kernels from which the answer mentions them."""
 
@@ -181,7 +183,8 @@ class EmService:
             if outcome.maps is not None:
                 reply.send(False, 'EM ended before it could be cancelled; its maps are published')
             else:
-                reply.send(True, f'{outcome.message} (after {run.seconds:.1f} s); readings and earlier maps are kept')
+                rest = 'were deleted' if outcome.message == BY_RESET else 'are kept'
+                reply.send(True, f'{outcome.message} (after {run.seconds:.1f} s); readings and earlier maps {rest}')
 
         run.end_requested = True
         run.waiting.append(ended)
@@ -209,7 +212,7 @@ class EmService:
         """Forget the maps, and cancel the current run."""
         self.worker.cancel()
         if self.current is not None:
-            _fail_all(self.current.then, 'EM was cancelled by reset')
+            _fail_all(self.current.then, BY_RESET)
         self._generation = self._publishers.generation
         self.maps, self.found, self.last_run = None, None, 'none since the reset'
         self.wrong_input, self.drive_faults = [], []
@@ -236,7 +239,7 @@ class EmService:
         def finish(outcome: Outcome) -> None:
             # all callers get the same outcome
             if generation != self._publishers.generation:
-                outcome.maps, outcome.message = None, 'EM was cancelled by reset'
+                outcome.maps, outcome.message = None, BY_RESET
             elif outcome.maps is None:
                 why = self._why_no_maps(run, data)
                 outcome.message, outcome.replaced = why or outcome.message, why == REPLACED

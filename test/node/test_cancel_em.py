@@ -108,11 +108,16 @@ def test_reset_is_named_as_the_cause_of_the_cancellation(
     endless = Endless(monkeypatch)
     first = responses_of(node.em.run_em)
     robot.until(endless.running.is_set)
-    cancelled = responses_of(node.em.cancel)
-    assert robot.call(node.reset)[0]
-    robot.until(lambda: first and cancelled)
+    before = responses_of(node.em.cancel)
+    reset = responses_of(node.reset)
+    after = responses_of(node.em.cancel)
+    robot.until(lambda: first and before and reset and after)
     assert first == [(False, 'EM was cancelled by reset')]
-    assert cancelled[0][1].startswith('EM was cancelled by reset (after ')
+    for ((success, message),) in (before, after):
+        assert success
+        assert message.startswith('EM was cancelled by reset (after ')
+        # nothing is kept
+        assert message.endswith('readings and earlier maps were deleted')
 
 
 def test_cancel_without_a_run_fails(inside: Callable[..., Inside]) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import nullcontext
 from types import SimpleNamespace
 from typing import Any
 
@@ -16,11 +17,23 @@ from std_srvs.srv import SetBool, Trigger
 from forward_grid_mapper.node.deferred import CALLS, DeferredService, Reply
 
 
+class Handle(nullcontext[None]):
+    """Stand-in for the handle of a service, which rclpy locks with a context that has no value."""
+
+    def __init__(self, untaken: list[tuple[Any, Any]]) -> None:
+        super().__init__()
+        self._untaken = untaken
+
+    def service_take_request(self, kind: Any) -> tuple[Any, Any]:
+        return self._untaken.pop(0) if self._untaken else (None, None)
+
+
 class Serving:
     """Stand-in for a node, with what a service needs; `call` processes a request like the executor of rclpy."""
 
     def __init__(self) -> None:
         self.sent: list[tuple[Any, Any]] = []
+        self.untaken: list[tuple[Any, Any]] = []
         self.logged: list[str] = []
 
     def get_logger(self) -> Any:
@@ -29,7 +42,9 @@ class Serving:
     def create_service(self, kind: Any, name: str, callback: Any, qos_profile: Any) -> Any:
         assert qos_profile.depth >= 2000 and qos_profile.reliability == ReliabilityPolicy.RELIABLE
         self.callback = callback
-        self.service = SimpleNamespace(send_response=lambda response, header: self.sent.append((response, header)))
+        self.service = SimpleNamespace(
+            send_response=lambda response, header: self.sent.append((response, header)), handle=Handle(self.untaken)
+        )
         return self.service
 
     def call(self, header: str, request: Any = None) -> None:
@@ -127,3 +142,15 @@ def test_waiting_calls_fail_when_the_service_ends() -> None:
     replies[1].send(True, 'done')
     service.end('it ends')
     assert len(node.sent) == 2 and not service.open
+
+
+def test_calls_that_nobody_has_taken_fail_when_the_service_ends() -> None:
+    node, replies = Serving(), list[Reply]()
+    service = DeferredService(node, Trigger, 'later', replies.append)
+    node.untaken += [(Trigger.Request(), 'first'), (Trigger.Request(), 'second')]
+    service.end('it ends')
+    assert [(r.success, r.message, header) for r, header in node.sent] == [
+        (False, 'it ends', 'first'),
+        (False, 'it ends', 'second'),
+    ]
+    assert not replies and not service.open
