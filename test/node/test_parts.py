@@ -306,7 +306,9 @@ def test_warning_at_nine_tenths_of_max_readings(inside: Callable[..., Inside]) -
         '92 readings, and max_readings is 100: beyond it, the oldest are removed where readings are densest'
         in readings['message']
     )
-    robot.drive(92, 30)
+    robot.drive(92, 8)
+    assert robot.status('readings')['level'] == WARN, 'one more, and the first is removed'
+    robot.drive(100, 22)
     assert robot.status('readings')['readings kept to map from'] == '100 of at most 100'
 
 
