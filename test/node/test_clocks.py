@@ -123,6 +123,15 @@ def test_rare_odometry_gives_no_warning_of_clocks(clock: Any) -> None:
     assert '1.5 s behind' in faults(late)[0]
 
 
+def test_stamps_that_range_time_offset_corrects_give_no_warning(clock: Any) -> None:
+    robot = Taking(range_time_offset=1.8)
+    robot.intake.begin()
+    drive(robot, 12, 1.8, 'sonar')
+    assert faults(robot) == []
+    drive(robot, 12, 0.0, 'other', first=12)
+    assert '1.8 s ahead' in faults(robot)[0]
+
+
 def test_late_and_early_sensors_give_separate_warnings(clock: Any) -> None:
     robot = taking()
     for k in range(70):
