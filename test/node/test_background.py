@@ -7,8 +7,10 @@ import queue
 import sys
 import threading
 import time
+import weakref
 from collections import deque
 from collections.abc import Callable, Iterator
+from functools import partial
 from typing import Any
 
 import pytest
@@ -65,6 +67,20 @@ def test_error_is_reported_logged_and_shown(worker: Worker, error: BaseException
     assert worker.trouble == 'no second try'
     assert worker.ask(lambda: 7) == 7
     assert worker.ask(lambda: worker.trouble) == ''
+
+
+def test_finished_work_is_released_while_the_worker_waits(worker: Worker) -> None:
+    """It may hold the readings of a drive, and the next work may come an hour later."""
+
+    class Held:
+        pass
+
+    held = Held()
+    gone = threading.Event()
+    weakref.finalize(held, gone.set)
+    worker.put(partial(isinstance, held, Held))
+    del held
+    assert gone.wait(60.0)
 
 
 def test_lasting_trouble_stays_until_it_is_cleared() -> None:

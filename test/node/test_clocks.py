@@ -123,6 +123,15 @@ def test_rare_odometry_gives_no_warning_of_clocks(clock: Any) -> None:
     assert '1.5 s behind' in faults(late)[0]
 
 
+def test_stamps_that_range_time_offset_corrects_give_no_warning(clock: Any) -> None:
+    robot = Taking(range_time_offset=1.8)
+    robot.intake.begin()
+    drive(robot, 12, 1.8, 'sonar')
+    assert faults(robot) == []
+    drive(robot, 12, 0.0, 'other', first=12)
+    assert '1.8 s ahead' in faults(robot)[0]
+
+
 def test_late_and_early_sensors_give_separate_warnings(clock: Any) -> None:
     robot = taking()
     for k in range(70):
@@ -254,6 +263,17 @@ def test_wrong_stamps_are_in_the_notes_until_a_reset(clock: Any) -> None:
     assert robot.intake.clock_notes() == []
 
 
+def test_sensor_with_a_clock_ahead_is_in_the_notes(clock: Any) -> None:
+    """The largest lead of all windows counts, also if the last ones are smaller."""
+    robot = taking()
+    drive(robot, 12, -4.0, 'sonar')
+    drive(robot, 12, -2.0, 'sonar', first=12)
+    drive(robot, 12, 0.0, 'sonar', first=24)
+    assert faults(robot) == []
+    (note,) = robot.intake.clock_notes()
+    assert note.startswith('the stamps of sonar are 4.0 s ahead of those of odometry that arrived at the same time')
+
+
 def test_arrivals_without_times_of_the_middleware(monkeypatch: pytest.MonkeyPatch) -> None:
     """The node is late by up to 3 s, and the clock of the sender by 10 s."""
     now, found = 2000.0, Arrivals()
@@ -273,6 +293,22 @@ def test_arrivals_without_times_of_the_middleware(monkeypatch: pytest.MonkeyPatc
     assert last == pytest.approx(now)
     assert found.of('sonar', {'received_timestamp': 5, 'source_timestamp': 3}) == 5
     assert found.of('sonar', {'source_timestamp': 0}) == round(now * 1e9)
+
+
+def test_delay_of_the_node_when_delays_are_found_anew_is_no_later_arrival(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The first message of the next half minute may wait for the node, as in a pause of its executor."""
+    now, found = 2000.0, Arrivals()
+    monkeypatch.setattr(clocks.time, 'time_ns', lambda: round(now * 1e9))
+
+    def arrival(sent: float) -> float:
+        return found.of('sonar', {'source_timestamp': round(sent * 1e9), 'received_timestamp': 0}) / 1e9
+
+    for k in range(300):
+        now = 2000.0 + 0.1 * k
+        assert arrival(now - 0.1) == pytest.approx(now)
+    for k in range(20):
+        now = 2033.0 + 0.01 * k
+        assert arrival(2029.9 + 0.1 * k) == pytest.approx(2030.0 + 0.1 * k)
 
 
 def test_stamps_of_zero_give_no_warning_of_clocks(clock: Any) -> None:

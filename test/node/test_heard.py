@@ -95,6 +95,16 @@ def test_no_sensor_is_silent_if_all_have_stopped(clock: Clock) -> None:
     assert set(sensors.silent()) == {'left'}
 
 
+def test_pauses_of_all_do_not_change_the_usual_interval(clock: Clock) -> None:
+    """Otherwise a sensor that sends once in a while would be silent after bags that were paused several times."""
+    sensors = Heard()
+    pass_by(clock, sensors, 100.0, slow=5.0)
+    for _ in range(30):
+        pass_by(clock, sensors, 60.0)
+        sensors.note('slow')
+    assert sensors.patience == pytest.approx(USUAL * 5.0)
+
+
 def test_first_sensor_after_a_pause_of_all_does_not_make_the_others_silent(clock: Clock) -> None:
     """As when a bag is paused: the report may come between their messages."""
     sensors = Heard()

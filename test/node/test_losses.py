@@ -164,6 +164,15 @@ def test_sensor_that_was_switched_off_has_lost_nothing() -> None:
     assert losses.lost == 2, 'its rate is still known'
 
 
+def test_messages_while_the_node_was_not_subscribed_are_not_lost() -> None:
+    losses, stamp = begun()
+    numbered(losses, 1, 2, 3)
+    losses.begin_anew()
+    losses.taken({}, 'sonar', stamp + 20 * NANOSECONDS)
+    numbered(losses, 50)
+    assert losses.lost == 0
+
+
 def test_stamp_that_does_not_advance_is_ignored() -> None:
     assert at_steps(Losses(lambda: 1), *[1.0] * 20, 0.0, 3.0)[-1] == 2
     assert at_steps(Losses(lambda: 1), *[1.0] * 20, -5.0, 1.0, 3.0)[-1] == 2

@@ -25,6 +25,8 @@ from forward_grid_mapper.core.messages import reading_buffer
 from forward_grid_mapper.core.messages.reading_buffer import ReadingBuffer
 from forward_grid_mapper.core.online_map import OnlineMap
 from forward_grid_mapper.core.trajectory.following import Follower
+from forward_grid_mapper.files.journal_format import Contents
+from forward_grid_mapper.files.journal_reader import read
 from forward_grid_mapper.node import consistency_check, em, main, map_publishers, saver
 from forward_grid_mapper.node.intake import AT_ONCE
 from forward_grid_mapper.node.run_input import RunInput
@@ -271,6 +273,22 @@ def test_lost_messages_are_counted_and_reported(inside: Callable[..., Inside], t
     assert robot.status('readings')['readings lost in the middleware (estimated)'] == '0'
 
 
+def test_readings_received_just_before_a_reset_are_in_the_journal(
+    inside: Callable[..., Inside], tmp_path: Path
+) -> None:
+    """The journal is written by a timer, and keeps what a reset deletes."""
+    robot = inside(journal=str(tmp_path / 'journal')).start()
+    robot.drive(0, 20)
+    # without a turn of the executor
+    for k in range(20, 25):
+        robot.odometry(100.0 + 0.05 * k)
+        robot.range(100.0 + 0.05 * k)
+    assert robot.begin(robot.node.reset).sent[0][0]
+    robot.close()
+    kept = read(tmp_path / 'journal' / 'drive_0001.journal', Contents())
+    assert sum(map(len, kept)) == 25
+
+
 def test_parameters_of_the_association_change_at_run_time(inside: Callable[..., Inside]) -> None:
     robot = inside().start()
     node = robot.node
@@ -307,7 +325,9 @@ def test_warning_at_nine_tenths_of_max_readings(inside: Callable[..., Inside]) -
         '92 readings, and max_readings is 100: beyond it, the oldest are removed where readings are densest'
         in readings['message']
     )
-    robot.drive(92, 30)
+    robot.drive(92, 8)
+    assert robot.status('readings')['level'] == WARN, 'one more, and the first is removed'
+    robot.drive(100, 22)
     assert robot.status('readings')['readings kept to map from'] == '100 of at most 100'
 
 

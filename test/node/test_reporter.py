@@ -62,6 +62,22 @@ def test_reason_is_that_of_the_last_second_also_after_a_reset(clock: Any) -> Non
     assert level == WARN and '55 of 65' in message and 'most of them as empty_frame_id' in message
 
 
+def test_share_that_keeps_a_warning_begins_none_after_a_reset(clock: Any) -> None:
+    """Between the share that begins a warning and that which ends it."""
+    robot, health = Taking(), Health()
+    robot.intake.begin()
+    drive(robot, 0, 40, 60)
+    assert judged(robot, health)[0] == WARN
+    clock.now += 1.0
+    drive(robot, 100, 920, 80)
+    assert judged(robot, health)[0] == WARN, 'still many of ten seconds'
+    robot.associator.clear()
+    robot.intake.forget()
+    clock.now += 1.0
+    drive(robot, 1100, 46, 4)
+    assert judged(robot, health) == (OK, 'mapping')
+
+
 @pytest.mark.parametrize(('share', 'expected'), [(0.33, {WARN}), (0.12, {WARN}), (0.05, {OK})])
 def test_constant_share_of_rejected_readings_has_a_constant_verdict(
     clock: Any, share: float, expected: set[bytes]
@@ -101,6 +117,7 @@ def test_delay_is_zero_without_times_of_the_middleware() -> None:
     assert delay() == '0.0'
     health.taken(time.time_ns() - 2 * NANOSECONDS)
     assert 2000 <= float(delay()) < 10_000
+    assert delay() == '0.0', 'that of the readings since the last report'
 
 
 def test_constant_stamp_of_odometry_gives_a_warning(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -156,6 +173,9 @@ def test_sensor_with_rare_readings_has_a_constant_verdict(clock: Any) -> None:
     robot.associator.unknown_frames.add('ghost')
     verdicts = seconds(robot, clock, health, 5, 1, 'sonar')
     assert {text for _, text in verdicts} == {'no pose on the robot for ghost'}
+    # that sensor was switched off: its frame is still unknown, but no reading is lost any more
+    verdicts = seconds(robot, clock, health, int(RECENT), 1, 'sonar')
+    assert verdicts[-1] == (OK, 'mapping')
 
 
 def test_sensor_with_readings_every_five_seconds_is_not_silent(clock: Any) -> None:

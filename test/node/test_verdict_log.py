@@ -39,6 +39,20 @@ def test_short_fault_is_not_logged(clock: Any) -> None:
     assert node.warned == []
 
 
+def test_faults_have_not_ended_while_another_part_has_one(clock: Any) -> None:
+    """Readings may be mapped while messages are lost: `well` is the verdict on the readings alone."""
+    node = PlainNode()
+    log = VerdictLog(node)
+    for _ in range(3):
+        log.update(['gap', 'messages were lost'], False)
+    for _ in range(2 * ENDED):
+        log.update(['messages were lost'], True)
+    assert node.warned == ['gap', 'messages were lost']
+    for _ in range(ENDED):
+        log.update([], True)
+    assert node.warned[2:] == [WELL]
+
+
 def test_intermittent_fault_is_logged_once_and_has_no_end(clock: Any) -> None:
     node = PlainNode()
     log = VerdictLog(node)

@@ -15,6 +15,12 @@ from forward_grid_mapper.core.common.grid import Grid
 from forward_grid_mapper.core.common.parameters import Parameters
 from forward_grid_mapper.core.common.readings import Readings
 from forward_grid_mapper.core.learning.sensor_health import (
+    BIN,
+    BINS,
+    FEW,
+    FEW_SHARE,
+    WINDOW,
+    _of_histograms,
     commonest_range,
     first_obstacles,
     health_counts,
@@ -260,3 +266,23 @@ def test_most_frequent_range() -> None:
     count, middle = commonest_range(np.array([1.0, 3.05, 3.0, 3.1, 5.0]))
     assert (count, middle) == (3, pytest.approx(3.05))
     assert commonest_range(np.empty(0))[0] == 0
+
+
+@given(st.lists(st.floats(0.0, 8.0), min_size=1, max_size=30))
+def test_most_frequent_range_from_counts_is_near_that_of_the_ranges(ranges: list[float]) -> None:
+    """Bins lose the position within 5 cm: the count may be smaller, but the middle is that of a window with it."""
+    z = np.array(ranges)
+    row = np.bincount(np.minimum(z / BIN, BINS - 1).astype(np.int64), minlength=BINS)
+    ((count, middle),) = _of_histograms(row[None])
+    assert 1 <= count <= commonest_range(z)[0]
+    assert count == np.count_nonzero(np.abs((np.floor(z / BIN) + 0.5) * BIN - middle) < WINDOW / 2)
+
+
+def test_sensor_with_far_fewer_readings_than_the_others_has_no_verdict() -> None:
+    readings = rooms()
+    mine = np.flatnonzero(readings.sensor == 8)
+    usual = np.count_nonzero(readings.sensor == 9)
+    others = np.flatnonzero(readings.sensor != 8)
+    rare = readings.select(np.concatenate([np.repeat(others, 3), mine[: FEW + 1]]))
+    assert FEW < np.count_nonzero(rare.sensor == 8) < FEW_SHARE * 3 * usual
+    assert sensor_health(mapped(rare))['sonar_08'].verdict == 'few readings'

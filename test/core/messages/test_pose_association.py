@@ -237,6 +237,20 @@ def test_jump_back_of_time_rejects_waiting_readings_and_keeps_others() -> None:
     assert accounted(p)
 
 
+def test_jump_back_of_time_rejects_readings_that_wait_for_a_mount() -> None:
+    """With stamps of the new time, they would be placed by poses of the old one, or be counted twice."""
+    known: set[str] = set()
+    p = PoseAssociator(lambda base, frame, stamp: SENSOR if frame in known else LATER, clock=Clock())
+    p.add_odometry(odometry(100.0))
+    p.add_range(sonar(100.0))
+    p.add_odometry(odometry(2.0, 7.0))
+    assert (p.rejected, p.waiting) == ({'time_jump': 1}, 0)
+    assert accounted(p)
+    known.add('sonar')
+    p.add_odometry(odometry(3.0, 7.0))
+    assert len(p.buffer) == 0 and accounted(p)
+
+
 def test_odometry_out_of_order_is_sorted() -> None:
     p = associator()
     for second, x in ((0.0, 0.0), (0.4, 4.0), (0.2, 1.0)):
@@ -507,6 +521,18 @@ def test_clock_behind_restored_readings_jumped_back_once(first: float, jumps: in
     p.clear()
     p.add_odometry(odometry(1.0))
     p.clear()
+    assert p.time_jumps == 0
+
+
+def test_clock_behind_restored_readings_is_no_jump_after_a_reset() -> None:
+    """The restored readings are forgotten, and so is their time."""
+    before = associator()
+    before.add_odometry(odometry(10.0))
+    before.add_range(sonar(10.0))
+    p = associator()
+    p.restore(before.buffer.snapshot())
+    p.clear()
+    p.add_odometry(odometry(1.0))
     assert p.time_jumps == 0
 
 

@@ -109,6 +109,19 @@ def test_poses_more_than_a_metre_apart_are_no_jumps(bent: tuple[Readings, Odomet
     assert jumps(Odometry.of(odometry.stamp, pose)).tolist() == [10]
 
 
+def test_restart_after_a_full_turn_is_at_zero() -> None:
+    """The yaw of odometry is unwrapped, so that of a driver which was restarted may be a multiple of 360 degrees."""
+    count, gap = 100, 30 * 10**9
+    pose = np.zeros((2 * count, 3))
+    pose[:count, 0] = pose[count:, 0] = 0.02 * np.arange(count)
+    pose[:count, 2] = np.linspace(0.0, 2 * np.pi, count)
+    stamp = np.arange(2 * count) * 10**8
+    stamp[count:] += gap
+    odometry = Odometry.of(stamp, pose)
+    assert odometry.pose[count, 2] == pytest.approx(2 * np.pi)
+    assert jumps(odometry).tolist() == [count] and not len(doubtful_steps(odometry))
+
+
 @pytest.mark.slow
 def test_drive_with_few_poses_is_refined(exact: Recording, bent: tuple[Readings, Odometry]) -> None:
     readings, odometry = with_few_poses(*bent, 1.1)
