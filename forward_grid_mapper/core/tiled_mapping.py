@@ -90,11 +90,11 @@ class TiledMapper:
         self._visit('maps of tiles', mosaic, range(len(mosaic.tiling.tiles)), finished, self._finish(mosaic))
         self._visit('uncertainty', mosaic, mosaic.filled, judged, mosaic.take_judged)
         begun = time.perf_counter()
-        watch('live map', None)
+        watch('standard map', None)
         live = LogOddsMap(p)
         live.add(readings)
         shown = live.probability(mosaic.grid)
-        self._seconds['live map'] = time.perf_counter() - begun
+        self._seconds['standard map'] = time.perf_counter() - begun
         return self._maps(mosaic, shown, converged)
 
     def _visit(

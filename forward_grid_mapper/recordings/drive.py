@@ -159,7 +159,7 @@ class Drive:
         With all readings in the map frame.
     source : dict
         Data for the report.
-    live : LogOddsMapOfAll
+    live : FullLiveMap
     mounts : mapping of str to Pose2, optional
         If there is no recorded odometry, the given poses of sensors on the robot, by frame.
     """

@@ -172,9 +172,9 @@ class ScaledMapper:
         order = sorted(result, key=lambda k: (result[k]['first'], result[k]['digest'], result[k]['source']['bag']))
         described = {k: _described(result[k]) for k in order}
         check_frames(list(described.values()))
-        by_echoes: dict[str, list[int]] = {}
+        by_echoes: dict[str | int, list[int]] = {}
         for k in order:
-            by_echoes.setdefault(result[k]['echoes'], []).append(k)
+            by_echoes.setdefault(result[k]['echoes'] or k, []).append(k)
         kept = [same[0] for same in by_echoes.values()]
         for first, *others in by_echoes.values():
             if others:

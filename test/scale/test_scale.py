@@ -599,3 +599,15 @@ def test_copy_of_a_drive_is_left_out(drives: Path, one_process: Path, tmp_path: 
     report = json.loads((folder / 'report.json').read_text())
     assert [w for w in report['warnings'] if 'is the same drive as' in w and 'drive_9' in w]
     np.testing.assert_array_equal(read_npz(folder / 'maps.npz').ml, read_npz(one_process / 'maps.npz').ml)
+
+
+@scaled
+def test_drives_without_echoes_are_not_copies_of_each_other(tmp_path: Path) -> None:
+    silent = tmp_path / 'silent'
+    for number in range(2):
+        drive = campus_drive(number, 1, 200, sonars=front_array())
+        ranges = [message._replace(range=float('inf')) for message in drive.ranges]
+        write_bag(silent / f'drive_{number}', dataclasses.replace(drive, ranges=ranges), 'mcap', False)
+    report = json.loads((made_here(silent, tmp_path, Here()) / 'report.json').read_text())
+    assert not [w for w in report['warnings'] if 'the same drive as' in w]
+    assert report['counts']['accepted'] == 2 * len(drive.ranges)
