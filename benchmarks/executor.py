@@ -4,7 +4,7 @@
 usage: executor.py [--readings 500000] [--rate 500] [--seconds 30] [--cold] [--max-readings 500000]
        executor.py --messages
 
-Starts a node in its own process, with the online map and a journal of so many readings of the simulated corridor to
+Starts a node in its own process, with the online map and a journal of this many readings of the simulated corridor to
 restore, publishes Range and odometry meanwhile, and calls every service: EM runs, maps are requested and saved,
 parameters change, and at last all is reset. A timer of 2 ms in the node's own executor measures the delay of its calls:
 `late` is the longest delay, of which the executor's own thread computed for `own` ms. `most own` is its longest
@@ -86,7 +86,7 @@ def run_node(arguments: list[str]) -> int:
 
 
 def readings_of(count: int) -> Any:
-    """Return so many readings: tours of the corridor, one after the other, each with its own noise."""
+    """Return this many readings: tours of the corridor, one after the other, each with its own noise."""
     from forward_grid_mapper.core.common.readings import Readings
     from forward_grid_mapper.simulation.drive import corridor_drive
 

@@ -195,7 +195,7 @@ class Fuzz:
         self.node.pause(Answer(SetBool.Request(data=value)))
 
     def run(self, messages: int) -> float:
-        """Send so many messages; return the growth of memory after the first third, MB."""
+        """Send this many messages; return the growth of memory after the first third, MB."""
         begun = 0.0
         while self.total < messages:
             for _ in range(min(500, messages - self.total)):

@@ -93,8 +93,8 @@ class Others:
 def undisturbed(work: Callable[[], T], runs: int) -> tuple[list[T], float]:
     """Return the results of the `runs` runs with the least use by other processes, and their largest such use.
 
-    Runs are repeated until others used less than `LITTLE` of the machine in so many runs, or until PATIENCE seconds are
-    over. So runs are selected by the use of others, never by their own duration.
+    Runs are repeated until others used less than `LITTLE` of the machine in this many runs, or until PATIENCE seconds
+    are over. So runs are selected by the use of others, never by their own duration.
     """
     done: list[tuple[float, int, T]] = []
     patience, begin = float(os.environ.get(PATIENCE, '0')), time.perf_counter()
@@ -178,7 +178,7 @@ def _sum(words: Any) -> Any:
 
 
 def stream_seconds(size: float, runs: int) -> float:
-    """Return the time to read so many bytes of memory once in sequence, on one core, seconds."""
+    """Return the time to read this many bytes of memory once in sequence, on one core, seconds."""
     words = np.ones(max(int(size) // 8, 1), np.uint64)
     _sum(words)
     return timed(lambda: _sum(words), runs)

@@ -7,7 +7,7 @@ cosmic-ray 8 makes the changes (`pip install cosmic-ray`, in its own environment
 the checkout: operators, comparisons, numbers and constants are replaced, loops and exceptions left out, and so on. The
 tests of a module are run after each change, without compilation of kernels unless a part of the node starts. The score
 is the fraction of changes with which a test fails, or does not end; equivalent changes count against it.
-`--survivors` prints undetected ones. Of more than `--most` changes of a module, so many are tried, drawn with
+`--survivors` prints undetected ones. Of more than `--most` changes of a module, this many are tried, drawn with
 `--seed`.
 
 Changes of `|` are left out, nearly all of which are in annotations that are never evaluated, and those of an operator
@@ -92,7 +92,7 @@ def copy_of_checkout(folder: Path) -> None:
 
 
 def draw(session: Path, most: int, seed: int) -> int:
-    """Keep so many of the planned changes; return their number before."""
+    """Keep this many of the planned changes; return their number before."""
     with contextlib.closing(sqlite3.connect(session)) as database, database:
         found = database.execute(
             'select job_id from mutation_specs where job_id not in (select job_id from work_results) '

@@ -81,7 +81,7 @@ class Load:
         header.stamp.sec, header.stamp.nanosec = divmod(time.time_ns(), 1_000_000_000)
 
     def run(self, rate: float, seconds: float, em: bool) -> None:
-        """Publish `rate` readings a second for so many seconds."""
+        """Publish `rate` readings a second for this many seconds."""
         begin = time.monotonic()
         fired = moved = 0
         running = None

@@ -69,7 +69,7 @@ def ros(message: RangeMessage | OdometryMessage) -> Range | Odometry:
 
 
 def messages(tours: int) -> Iterator[RangeMessage | OdometryMessage]:
-    """Yield the messages of so many tours by stamp, one tour after the other."""
+    """Yield the messages of this many tours by stamp, one tour after the other."""
     shift = 0
     for seed in range(tours):
         drive = corridor_drive(seed, passes=2)

@@ -81,7 +81,7 @@ def in_pieces(world: World, rng: np.random.Generator) -> World:
 
 
 def corridors(seed: int, legs: int) -> tuple[World, np.ndarray]:
-    """Return a building with rooms along a corridor around it, and a path along so many of its sides."""
+    """Return a building with rooms along a corridor around it, and a path along this many of its sides."""
     rng = np.random.default_rng([seed, 5])
     width, height = (int(side * rng.uniform(0.8, 1.2)) for side in (420, 260))
     deep, across = int(rng.integers(38, 55)), int(rng.integers(17, 24))
@@ -283,7 +283,7 @@ def main() -> None:
     parser.add_argument('--first-seed', type=int, default=0, help='0 to 9, 20 and 21 were tuned on')
     parser.add_argument('--maps', action='store_true', help='score the maps of simulated runs, too')
     parser.add_argument('--shared', type=Path, help='folder of recordings with corrected odometry, instead')
-    parser.add_argument('--drawn', type=int, help='so many buildings drawn at random, instead')
+    parser.add_argument('--drawn', type=int, help='this many buildings drawn at random, instead')
     parser.add_argument('--simulators', action='store_true', help='places like the worlds of simulators, instead')
     parser.add_argument('--distance', type=float, nargs='+', help='metres of longer and longer drives, instead')
     options = parser.parse_args()

@@ -13,7 +13,7 @@ from .source import Channel, RawMessage, Source, close_all, one_line
 
 
 class Interleaved:
-    """Several sources whose messages are read by log time; each is opened for reading when its begin is reached.
+    """Several sources whose messages are read by log time; each is opened for reading when its start is reached.
 
     Parameters
     ----------

@@ -33,7 +33,7 @@ from .transform_chain import TransformChain, chain_of, constant_transforms
 _CONVERSIONS: dict[str, Callable[[Any], RangeMessage | OdometryMessage | None]] = {RANGE: range_message, **POSES}
 _PROGRESS_STEP = 1000
 MOST_SEARCHED = 20_000
-"""Most messages in which frames are searched: half of them at the begin, the others all over the bag."""
+"""Most messages in which frames are searched: half of them at the start, the others all over the bag."""
 
 BATCH = 16
 """Steps of progress after which messages are decoded: 12 MB of Odometry."""

@@ -245,7 +245,7 @@ def _enough_memory() -> Iterator[None]:
 
 
 def at_once(work: Callable[[int], T], numbers: Iterable[int], jobs: int) -> Iterator[T]:
-    """Yield the results of `work` for each number, in any order, from so many processes."""
+    """Yield the results of `work` for each number, in any order, from this many processes."""
     if jobs == 1:
         yield from map(work, numbers)
         return

@@ -29,7 +29,7 @@ from .search.search import Progress, Search, SearchResult
 from .sensor.forward_model import ForwardModel
 
 Watch = Callable[[str, Progress | None], None]
-"""Receives the name of each stage at its begin, and the progress after each iteration of the search."""
+"""Receives the name of each stage at its start, and the progress after each iteration of the search."""
 
 P = ParamSpec('P')
 R = TypeVar('R')

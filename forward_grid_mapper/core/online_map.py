@@ -36,7 +36,7 @@ from .search.search import LEAST, Search
 from .sensor.cone_table import effective_sigma, grid_of, reach_of
 
 SAME_PLACE = 0.5
-"""Poses of equal readings differ by less than so many cells, and this fraction of the half angle."""
+"""Poses of equal readings differ by less than this many cells, and this fraction of the half angle."""
 
 SAME_RANGE = 0.5
 """Ranges of equal readings differ by less than this fraction of σ."""

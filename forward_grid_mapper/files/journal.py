@@ -250,7 +250,7 @@ class Journal:
         self._queue(Everything(head, readings, dict(self._numbers), points, first), len(readings), 0)
 
     def close(self, seconds: float = 2.0) -> None:
-        """Write the remaining rows if this takes at most so many seconds, and unlock the folder."""
+        """Write the remaining rows if this takes at most this many seconds, and unlock the folder."""
         with self._wake:
             self._closing = True
             self._wake.notify_all()

@@ -8,7 +8,7 @@ A journal file is an SQLite database in WAL mode:
     path       points of the robot's path in the map frame: x, y (float64)
     readings   number of the first reading of a block, and the block: rows of `ROW`
 
-Readings are counted from the begin of the drive. The count is the key of the table, so that a block that is written
+Readings are counted from the start of the drive. The count is the key of the table, so that a block that is written
 again after a failure is not stored twice.
 
 A file that continues an earlier one lacks the readings of that one, and counts its own from `OWN`. The readings of the

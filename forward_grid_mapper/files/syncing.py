@@ -29,7 +29,7 @@ class Syncer:
             self._changed = path
 
     def close(self, seconds: float) -> None:
-        """Sync once more, and wait at most so many seconds."""
+        """Sync once more, and wait at most this many seconds."""
         self._stop.set()
         self._thread.join(seconds)
 

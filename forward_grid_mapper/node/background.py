@@ -115,7 +115,7 @@ class Worker:
         self.trouble = ''
 
     def close(self, seconds: float) -> None:
-        """Drop the tasks that have not begun, and wait at most so many seconds for the running one."""
+        """Drop the tasks that have not begun, and wait at most this many seconds for the running one."""
         with self._wake:
             self._closed = True
             self._tasks.clear()

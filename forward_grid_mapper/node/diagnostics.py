@@ -40,7 +40,7 @@ STREAMS = ('odometry', 'stamp of odometry', 'range')
 """Inputs that keep changing while the robot sends."""
 
 NO_POSE = 'no pose on the robot for '
-"""Begin of the message that names frames without a pose."""
+"""Start of the message that names frames without a pose."""
 
 MAPPING = 'mapping'
 """The message if readings arrive, are accepted, and nothing is wrong."""

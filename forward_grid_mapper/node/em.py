@@ -146,7 +146,7 @@ class EmWorker:
             run.mapper.cancel()
 
     def close(self, seconds: float) -> None:
-        """Cancel the current run, and wait at most so many seconds for its end."""
+        """Cancel the current run, and wait at most this many seconds for its end."""
         self.cancel()
         self.worker.close(seconds)
 

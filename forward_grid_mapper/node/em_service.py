@@ -220,7 +220,7 @@ class EmService:
         self._consistency.forget()
 
     def close(self, seconds: float) -> None:
-        """Cancel the current run, and wait at most so many seconds for its end."""
+        """Cancel the current run, and wait at most this many seconds for its end."""
         self.worker.close(seconds)
 
     def _start(self, *callers: Callable[[Outcome], object]) -> Run:

@@ -94,7 +94,7 @@ class Following:
             self.follower = None
 
     def close(self, seconds: float) -> None:
-        """Cancel, and wait at most so many seconds for the end of the thread."""
+        """Cancel, and wait at most this many seconds for the end of the thread."""
         self.cancel()
         self.worker.close(seconds)
 

@@ -194,7 +194,7 @@ class MapFrame:
     timeout : float
         Longest wait, seconds by stamps; may be changed.
     dropped : int
-        Messages for which TF had no transform in time, since the begin or the last `forget`.
+        Messages for which TF had no transform in time, since the start or the last `forget`.
     """
 
     def __init__(self, map_frame: str, transforms: Transforms, timeout: float) -> None:

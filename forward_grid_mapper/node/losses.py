@@ -23,7 +23,7 @@ LOSS_WARNING = 10.0
 """Seconds for which the node warns of a loss."""
 
 STEADY = 8
-"""Intervals of similar length after which the rate of a sensor is steady; so many longer ones are another rate."""
+"""Intervals of similar length after which the rate of a sensor is steady; this many longer ones are another rate."""
 
 SWITCHED_OFF = 60 * NANOSECONDS
 """Nanoseconds without a stamp from which a sensor was rather switched off than its messages lost."""

@@ -127,7 +127,7 @@ class OnlineWorker:
             self.worker.put(lambda: self._publish(wanted, epoch), self._not_published)
 
     def close(self, seconds: float) -> None:
-        """Cancel the work, and wait at most so many seconds for the end of the thread."""
+        """Cancel the work, and wait at most this many seconds for the end of the thread."""
         self._map.cancel()
         self.worker.close(seconds)
 

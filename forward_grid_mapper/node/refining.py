@@ -81,7 +81,7 @@ class RefiningMapper:
         before : Found or None
             The current trajectory, on which the live map is based; None if it is that of odometry.
         now : callable, optional
-            Called in the thread of the run; returns the drive so far, so that the part after the begin is followed.
+            Called in the thread of the run; returns the drive so far, so that the part after the start is followed.
         """
         self.found: Found | None = None
         self._now = now

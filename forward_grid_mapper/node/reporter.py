@@ -142,7 +142,7 @@ class Reporter:
         return found
 
     def _map_frame_fault(self) -> str:
-        """Return the fault of the transform to the map frame, or ''; log its begin and its end."""
+        """Return the fault of the transform to the map frame, or ''; log its start and its end."""
         fault = self._map_frame.fault()
         if fault and not self._no_map_frame:
             self._no_map_frame = True

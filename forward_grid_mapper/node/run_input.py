@@ -94,7 +94,7 @@ class RunInput:
         return bounded(self._held.readings, self._bound)
 
     def drive(self) -> Drive:
-        """Return the drive up to the begin of the run.
+        """Return the drive up to the start of the run.
 
         After a restart, readings of the journal are the only record of the odometry before it; but after a jump back
         of the clock, the times of both overlap.

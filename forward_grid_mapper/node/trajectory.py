@@ -109,7 +109,7 @@ class Trajectory:
     following : Following or None
         Continues the trajectory while the robot drives; None if this is not wanted.
     driven : float
-        Metres since the begin of the drive, up to the last check; without noise of odometry while the robot stands.
+        Metres since the start of the drive, up to the last check; without noise of odometry while the robot stands.
     """
 
     def __init__(self, node: Any, associator: PoseAssociator, clock: Any) -> None:
@@ -189,7 +189,7 @@ class Trajectory:
     def mapper(
         self, parameters: Parameters, drive: Callable[[], Drive], now: Callable[[], Drive]
     ) -> RefiningMapper | Mapper:
-        """Return a mapper for a run; `drive` returns the drive at its begin, `now` the drive so far."""
+        """Return a mapper for a run; `drive` returns the drive at its start, `now` the drive so far."""
         self._refined_at, self._before_run = self.driven, self._associator.time_jumps
         refine, before = parameters.node.refine_poses and not self.obstacle, None
         if self.found is not None and self.correction is not None:

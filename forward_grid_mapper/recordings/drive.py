@@ -32,7 +32,7 @@ FEWEST_RETURNS = 4
 
 @dataclass(frozen=True)
 class Part:
-    """The part of a drive to map: its begin in seconds after the first message, and its duration in seconds."""
+    """The part of a drive to map: its start in seconds after the first message, and its duration in seconds."""
 
     start: float = 0.0
     duration: float = math.inf
@@ -47,7 +47,7 @@ class Part:
         return f'--start {self.start:g}{end}'
 
     def bounds(self, first: int) -> tuple[float, float]:
-        """Return the stamps of its begin and end, nanoseconds, the end excluded; `first` is the first of the drive."""
+        """Return the stamps of its start and end, nanoseconds, the end excluded; `first` is the first of the drive."""
         begin = first + _nanoseconds(self.start)
         return begin, begin + _nanoseconds(self.duration)
 

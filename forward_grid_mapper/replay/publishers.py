@@ -83,7 +83,7 @@ class Publishers:
     def add(self, topic: str, msgtype: str, latched: bool = False, depth: int = 0) -> None:
         """Create the publisher of a topic, which keeps this name here even if it is remapped.
 
-        With a `depth` it is reliable, but keeps only so many messages for subscribers that are late.
+        With a `depth` it is reliable, but keeps only this many messages for subscribers that are late.
 
         Raises
         ------
@@ -150,7 +150,7 @@ class Publishers:
         Raises
         ------
         InputError
-            Naming those without one after so many seconds, and a remedy.
+            Naming those without one after this many seconds, and a remedy.
         """
         deadline = time.monotonic() + seconds
         while unheard := [topic for topic in topics if not self._publishers[topic].get_subscription_count()]:

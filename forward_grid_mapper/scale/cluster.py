@@ -51,7 +51,7 @@ class Cluster:
     dashboard : str
         The address of Dask's dashboard.
     workers : int
-        Their number at the begin.
+        Their number at the start.
     memory : int
         Memory limit of the smallest one, bytes; 0 if there is none.
     """

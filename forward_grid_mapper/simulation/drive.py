@@ -93,7 +93,7 @@ def drive_sweeps(
     """Drive as in `drive`, with a sweep at each of the increasing distances `sweeps` along the path, metres.
 
     `walker`, shape (T, 2), is the position of another person at each sweep, metres; NaN for none. `start` is the stamp
-    at the begin, nanoseconds, and `rate` that of odometry between the sweeps, Hz.
+    at the start, nanoseconds, and `rate` that of odometry between the sweeps, Hz.
     """
     waypoints = np.asarray(waypoints, np.float64)
     if blocked(waypoints, world.segments):

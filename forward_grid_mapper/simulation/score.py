@@ -23,7 +23,7 @@ Mask = NDArray[np.bool_]
 VISIBLE_RAYS = 31
 
 SURFACE_DEPTH = 0.2
-"""A wall cell is visible if a ray hits it at most so many metres beyond the nearest hit of its cone."""
+"""A wall cell is visible if a ray hits it at most this many metres beyond the nearest hit of its cone."""
 
 
 @dataclass(frozen=True)

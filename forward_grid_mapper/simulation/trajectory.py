@@ -25,7 +25,7 @@ class Trajectory:
     pose : float64, shape (K, 3)
         x, y, yaw in the map frame, metres and radians.
     leg_time, leg_start : float64, shape (L,)
-        Begin of each straight leg, seconds, and its distance along the path, metres.
+        Start of each straight leg, seconds, and its distance along the path, metres.
     length : float
         Of the whole path, metres.
     """

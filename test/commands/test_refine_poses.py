@@ -200,7 +200,7 @@ def test_journal_is_refined_like_the_bag(tmp_path: Path, refined_drive: RefinedD
     a, b = (np.loadtxt(folder / 'trajectory.tum') for folder in (refined_drive.maps, tmp_path / 'journal'))
     assert len(a) > len(b) == len(np.unique(refined_drive.bent.readings.stamp))
     at = np.stack([np.interp(b[:, 0], a[:, 0], a[:, k]) for k in (1, 2)], 1)
-    # near its begin a trajectory may vary a little
+    # near its start a trajectory may vary a little
     assert rms_after_alignment(b[:, 1:3], at) < 0.1
     assert not any('poses of sensors have no effect' in warning for warning in of_journal['warnings'])
 

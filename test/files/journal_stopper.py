@@ -23,7 +23,7 @@ from journal_samples import made, opened, until, written
 from forward_grid_mapper.files import journal_format
 
 MODULES = str(Path(journal_format.__file__).parent / 'journal')
-"""Begin of the paths of the modules of the journal."""
+"""Start of the paths of the modules of the journal."""
 
 NEW = 20
 """Readings that each run adds, ten at a time."""

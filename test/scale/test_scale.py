@@ -70,7 +70,7 @@ def one_process(drives: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 class Here:
-    """A cluster in this process, which may be interrupted after so many tasks."""
+    """A cluster in this process, which may be interrupted after this many tasks."""
 
     workers, memory, dashboard = 1, 0, ''
 

@@ -35,7 +35,7 @@ LEAST_AGREEMENT = 0.5
 """Least length of the mean of the doubled bearings for a known normal; 1 if all agree, 0 if none do."""
 
 THROUGH = 2.0
-"""A reading passed a cell if its range is so many σ beyond it; shorter ranges may be echoes of the cell."""
+"""A reading passed a cell if its range is this many σ beyond it; shorter ranges may be echoes of the cell."""
 
 # Smooth surfaces, with a learned limit of the incidence angle
 
@@ -43,7 +43,7 @@ LEAST_RATE = 0.5
 """Least fraction of the readings within the limit that are echoes of the surface. With 0.4, maps have more dots."""
 
 CONTRAST = 6.0
-"""This rate must be so many times that of the readings beyond the limit."""
+"""This rate must be this many times that of the readings beyond the limit."""
 
 GAIN = 2.0
 """Nats by which two rates, within and beyond the limit, must be likelier than one."""
@@ -121,7 +121,7 @@ LEAST_EVIDENCE = 0.1
 """Least |evidence| of a cell that is observed although it is unknown on the maximum likelihood map, nats."""
 
 LEAST_NOTICING = 0.1
-"""If the evidence is against an obstacle, such a cell needs so many readings that would have detected any surface."""
+"""If the evidence is against an obstacle, such a cell needs this many readings that would have detected any surface."""
 
 # The standard map
 

@@ -207,7 +207,7 @@ class IndexedReadings:
         self.state = s._replace(cones=cones, reading_states=reading_states, observing=np.empty((room, 2), np.int32))
 
     def _make_room(self, words: int) -> None:
-        """Allocate so many words of pairs, and a workspace for the largest cone."""
+        """Allocate this many words of pairs, and a workspace for the largest cone."""
         s = self.state
         largest, words = int(self._totals[LARGEST]), min(words, self._words)
         if words > len(s.pairs.cell):

@@ -56,7 +56,7 @@ class Pairs(NamedTuple):
 
 
 def empty_pairs(words: int) -> Pairs:
-    """Return uninitialised pairs of so many words."""
+    """Return uninitialised pairs of this many words."""
     block = np.empty(words, np.uint32)
     return Pairs(block, block.view(np.float32), block.view(np.int32))
 

@@ -66,7 +66,7 @@ SAME_YAW = 0.01
 """The yaw of odometry is constant if it varies by less than this, radians."""
 
 SPINNING = 10.0
-"""No robot does half of its turning faster than so many radians a second; a yaw in degrees looks so."""
+"""No robot does half of its turning faster than this many radians a second; a yaw in degrees looks so."""
 
 TURNED, TURNING = 2 * math.pi, 0.05
 """Least total turn, radians, and least fraction of the time with such fast turns: odometry may jump now and then."""

@@ -20,8 +20,8 @@ COPIES = 0.3
 """Fraction of the readings that must be copies of others; a driver may send a value twice now and then."""
 
 COARSE, CROWDED = 1_000_000, 2.0
-"""All stamps are within so many nanoseconds after a whole second if nanosec is not filled in, or is in another unit;
-and a sensor has at least so many readings in each such second."""
+"""All stamps are within this many nanoseconds after a whole second if nanosec is not filled in, or is in another unit;
+and a sensor has at least this many readings in each such second."""
 
 AT_ONCE = 0.3
 """Fraction of the readings of a sensor that have the stamp of another one with a different range."""
@@ -57,28 +57,28 @@ MOST_CHANGED = 0.6
 """Fraction of the sensors whose ranges must change: people walk in front of some, but driving changes most."""
 
 STUCK, MOVED = 0.97, 2.0
-"""A stuck sensor repeats one range to the millimetre in this fraction of its readings, over so many metres of
+"""A stuck sensor repeats one range to the millimetre in this fraction of its readings, over this many metres of
 driving."""
 
 TURNED = 0.5
-"""The robot must have turned by so many radians as well: along a straight wall, a range may stay the same for long."""
+"""The robot must have turned by this many radians as well: along a straight wall, a range stays the same."""
 
 STOPPED, PAUSES = 10.0, 3.0
-"""A sensor stopped if others sent readings for so many seconds after its last one, and for so many times its longest
-pause before."""
+"""A sensor stopped if others sent readings for this many seconds after its last one, and for this many times its
+longest pause before."""
 
 FASTEST = 15.0
-"""No robot with sonars drives so many metres a second; 0.2 m/s in centimetres look like 20 m/s."""
+"""No robot with sonars drives this many metres a second; 0.2 m/s in centimetres look like 20 m/s."""
 
 HANDFUL, SWEEPS = 0.02, 2
 """Largest fraction of the readings, and of rounds of all sensors, that should not make the map much larger; one wrong
 pose affects a round."""
 
 MULTIPLE = 4.0
-"""The map is at least so many times as large with them."""
+"""The map is at least this many times as large with them."""
 
 LARGE = 400.0
-"""They add at least so many square metres; for small maps it does not matter."""
+"""They add at least this many square metres; for small maps it does not matter."""
 
 
 def input_warnings(readings: Readings) -> list[str]:

@@ -50,14 +50,14 @@ SAME = 0.0005
 """Metres within which two ranges are the same value of the driver."""
 
 BELOW, DIRECTIONS = 0.05, 3
-"""Within so many metres below that range there are few echoes, unlike for a wall; and it is sent in at least so many
-twelfths of the circle."""
+"""Within this many metres below that range there are few echoes, unlike for a wall; and it is sent in at least this
+many twelfths of the circle."""
 
 FLOOR = 0.1
-"""Within so many metres above the shortest range there are few echoes, if it stands for 'no echo'."""
+"""Within this many metres above the shortest range there are few echoes, if it stands for 'no echo'."""
 
 SCATTER = 0.5
-"""The σ of no sonar is so many metres."""
+"""The σ of no sonar is this many metres."""
 
 
 def range_warnings(readings: Readings) -> list[str]:

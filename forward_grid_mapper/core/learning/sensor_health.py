@@ -58,8 +58,8 @@ OFTEN = 0.3
 """A sensor with others to compare with is suspect from this fraction of random readings on: if its pose is wrong, the
 walls along which the robot drives still explain many."""
 SAME, WINDOW = 0.8, 0.2
-"""A sensor that repeats one range has at least this fraction of its readings, or of its short readings, within so many
-metres: it may hear its robot only now and then."""
+"""A sensor that repeats one range has at least this fraction of its readings, or of its short readings, within this
+many metres: it may hear its robot only now and then."""
 CLOSE = 0.7
 """If at least this fraction of the random readings is short, but not at one range, a person moves near the sensor."""
 BIN, BINS = 0.05, 400

@@ -84,7 +84,7 @@ class MountedReadings:
         return self.part(slice(first, first + most))
 
     def thinned(self, most: int) -> MountedReadings:
-        """Return at most so many of the readings (`thinned`)."""
+        """Return at most this many of the readings (`thinned`)."""
         return self if len(self) <= most else self.part(_few(len(self), most))
 
     def travel(self) -> tuple[NDArray[np.int64], Floats]:
@@ -105,7 +105,7 @@ class MountedReadings:
         )
 
     def shifted(self, seconds: float) -> Readings:
-        """Return the readings as if measured so many seconds after their stamps."""
+        """Return the readings as if measured this many seconds after their stamps."""
         stamp = (self.readings.stamp - self.readings.stamp[0]) / NANOSECONDS
         known, first = np.unique(stamp, return_index=True)
         columns = (self.robot[0], self.robot[1], np.unwrap(self.robot[2]))
@@ -138,7 +138,7 @@ class TrialMap(NamedTuple):
 
 
 def thinned(readings: Readings, most: int) -> Readings:
-    """Return at most so many readings, chosen at random, so that no sensor is preferred."""
+    """Return at most this many readings, chosen at random, so that no sensor is preferred."""
     return readings if len(readings) <= most else readings.select(_few(len(readings), most))
 
 

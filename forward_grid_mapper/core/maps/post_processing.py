@@ -53,7 +53,7 @@ def grown(cells: NDArray[np.bool_], length: float, evidence: Evidence) -> NDArra
 
 
 def grown_through(known: NDArray[np.bool_], passed: NDArray[np.bool_], steps: int) -> NDArray[np.bool_]:
-    """Return the cells known to be free, grown by so many steps through cells that readings passed."""
+    """Return the cells known to be free, grown by this many steps through cells that readings passed."""
     for _ in range(steps):
         known = known | (_grown(known) & passed)
     return known

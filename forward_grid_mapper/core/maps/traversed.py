@@ -35,7 +35,7 @@ MEANWHILE = 0.1
 this."""
 
 STRIDES = (0, 1, 2, 4, 8, 16)
-"""A line is drawn from the sensor of each reading to that of the reading so many later: itself, the next one, and
+"""A line is drawn from the sensor of each reading to that of the reading this many later: itself, the next one, and
 others across the robot."""
 
 

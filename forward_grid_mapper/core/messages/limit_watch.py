@@ -22,7 +22,7 @@ ENOUGH = 30
 """Fewest messages for a check."""
 
 BEYOND = 1.1
-"""A range is beyond max_range if it is so many times as large; many drivers send a little more for 'no echo'."""
+"""A range is beyond max_range if it is this many times as large; many drivers send a little more for 'no echo'."""
 
 MANY, MANY_OF_ONE = 0.15, 0.3
 """Fractions of the finite ranges that are beyond max_range, or below min_range, if units differ: of all sensors, which

@@ -29,7 +29,7 @@ MIDDLES = np.sqrt(EDGES[:-1].astype(np.float64) * EDGES[1:])
 """Nanoseconds that stand for the intervals of each pair of edges."""
 
 PERIODS = 3.5
-"""A pause is an interval of at least so many periods."""
+"""A pause is an interval of at least this many periods."""
 
 SLOWEST_SOUND = 300.0
 """Metres per second, less than on the coldest day."""
@@ -81,7 +81,7 @@ class _Intervals:
         return float(MIDDLES[np.searchsorted(total, 0.25 * total[-1])])
 
     def longer(self, than: float) -> float:
-        """Return the time in intervals that are longer than so many nanoseconds, nanoseconds."""
+        """Return the time in intervals that are longer than this many nanoseconds, nanoseconds."""
         return float((self.counts * MIDDLES)[than < MIDDLES].sum())
 
 

@@ -17,7 +17,7 @@ from .thinning import kept
 Columns = dict[str, NDArray[Any]]
 
 LARGE = 65_536
-"""From so many rows on, columns are copied to larger ones in steps, so that no reading waits for a long copy."""
+"""From this many rows on, columns are copied to larger ones in steps, so that no reading waits for a long copy."""
 
 STEP = 1024
 """Readings between two steps of the copy."""

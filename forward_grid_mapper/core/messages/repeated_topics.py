@@ -12,7 +12,7 @@ from collections.abc import Callable, Sequence
 from .message_batch import Ranges
 
 MOST = 20_000
-"""Messages that are compared, from the begin of the drive on."""
+"""Messages that are compared, from the start of the drive on."""
 
 ENOUGH = 30
 """Fewest pairs of ranges for a warning."""

@@ -18,7 +18,7 @@ class _Compilations(events.Listener):  # type: ignore[misc]
         self._lock = threading.Lock()
 
     def on_start(self, event: Any) -> None:
-        """Count the begin of a compilation."""
+        """Count the start of a compilation."""
         with self._lock:
             self.begun += 1
             self.running += 1

@@ -23,7 +23,7 @@ CORE = Path(__file__).parents[1]
 PREFIX = 'kernels_'
 
 UNUSED = 24 * 3600
-"""Machine code of other sources is removed so many seconds after its last use at a start; a process that runs longer
+"""Machine code of other sources is removed this many seconds after its last use at a start; a process that runs longer
 has all its kernels in memory."""
 
 

@@ -34,7 +34,7 @@ NAMES = {
 """Names of limit, usage and reclaimable memory in a control group, by version."""
 
 NO_LIMIT = 1 << 60
-"""A limit of so many bytes or more means no limit: v1 has a large number."""
+"""A limit of this many bytes or more means no limit: v1 has a large number."""
 
 
 def least_memory(cells: int, readings: int, threads: int) -> int:
@@ -61,7 +61,7 @@ def free_memory() -> int | None:
 
 
 def shortage(cells: int, readings: int, threads: int) -> str:
-    """Return why EM of so many readings on so many cells does not fit into the memory; empty if it may."""
+    """Return why EM of this many readings on this many cells does not fit into the memory; empty if it may."""
     free, needed = free_memory(), least_memory(cells, readings, threads)
     if free is None or needed <= free:
         return ''

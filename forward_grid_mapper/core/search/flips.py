@@ -23,7 +23,7 @@ def gain_of(s: State, prior: Prior, c: int) -> float:
 
 
 WORTH_WAITING = 0.5
-"""A cell is flipped if it still gains at least this fraction of its gain at the begin of the update."""
+"""A cell is flipped if it still gains at least this fraction of its gain at the start of the update."""
 
 
 Least = tuple[float, float]
@@ -122,7 +122,7 @@ def _flip_above(s: State, prior: Prior, cells: NDArray[np.int64], needed: Floats
 def flip_in_order(s: State, prior: Prior, least: Least, cells: NDArray[np.int64], gains: Floats) -> tuple[int, float]:
     """Flip those of `cells`, in order, that still gain enough; return their number and total gain.
 
-    `gains` are those at the begin of the update. A cell that lost much of its gain by the flip of another one is left
+    `gains` are those at the start of the update. A cell that lost much of its gain by the flip of another one is left
     to the next update, in which a better cell may come first.
     """
     return _flip_above(s, prior, cells, np.maximum(least[0] + least[1] * s.maps.seen[cells], WORTH_WAITING * gains))

@@ -1,7 +1,7 @@
 """The pose of the robot after jumps of odometry.
 
 After a restart, odometry does not tell where the robot is on the map, but it still measures how the robot moves. So the
-part between two jumps is a drive of its own. Its begin is searched around two guesses: where the robot stood before the
+part between two jumps is a drive of its own. Its start is searched around two guesses: where the robot stood before the
 jump, and where odometry has it, which is right if only messages are missing. There its readings are matched with the
 map of what was driven before. The same comparison tells whether a doubtful step is a jump.
 """
@@ -78,7 +78,7 @@ class Part(NamedTuple):
 
 
 class Begin(NamedTuple):
-    """The pose at the begin of a part on the map, shape (3,), and where it was found."""
+    """The pose at the start of a part on the map, shape (3,), and where it was found."""
 
     pose: Floats
     how: str
@@ -154,7 +154,7 @@ def parts_at(readings: Readings, odometry: Odometry, jumped_to: NDArray[np.int64
 
 
 def begins_of(parts: Sequence[Part], parameters: Parameters, stop: NDArray[np.uint8]) -> list[Begin]:
-    """Return the begin of each part on the map of those before it.
+    """Return the start of each part on the map of those before it.
 
     Raises
     ------
@@ -203,7 +203,7 @@ def _begin_after(
     parameters: Parameters,
     stop: NDArray[np.uint8],
 ) -> Begin:
-    """Return the begin of a part that follows a jump.
+    """Return the start of a part that follows a jump.
 
     Parameters
     ----------

@@ -59,7 +59,7 @@ class Correction:
         return Correction(_joined(self.odometry, odometry, after), _joined(self.trajectory, trajectory, after))
 
     def bounded(self, most: int) -> Correction:
-        """Return a correction of at most so many poses: those are dropped that interpolation replaces best."""
+        """Return a correction of at most this many poses: those are dropped that interpolation replaces best."""
         odometry, path = self.odometry, self.trajectory
         while len(odometry.stamp) > most:
             stay = hard_to_interpolate(path.stamp, path.pose)

@@ -48,7 +48,7 @@ from .walls import DIRECTIONS, votes_for, wall_votes
 from .windows import Odometry, Windows, cut
 
 SETTLED, LONGEST, SHIFT = 12, 44, 8
-"""Windows at the begin of the tail whose nodes are fixed (5 m, from which walls continue); most windows of the tail
+"""Windows at the start of the tail whose nodes are fixed (5 m, from which walls continue); most windows of the tail
 (18 m); windows that leave it in one step (3 m)."""
 
 LATE = NANOSECONDS // 5
@@ -287,7 +287,7 @@ class Follower:
         """Put the correction of the tail in force, or the proven one if that predicts readings better."""
         odometry = tail.odometry
         pose = windows.corrected(odometry.progress, odometry.pose, tail.nodes)
-        # the first pose is interpolated at the begin of a window
+        # the first pose is interpolated at the start of a window
         stamp, path = odometry.stamp[1:], compose(self._axes, pose[1:])
         now = self._settled.continued(Odometry(stamp, odometry.pose[1:]), Odometry(stamp, path))
         better = gain(np.zeros(len(self._gains)), np.array(self._gains)).sigmas

@@ -248,7 +248,7 @@ def doubts(at: NDArray[np.int64], certain: Floats) -> tuple[tuple[int, float], .
     ----------
     at : int64, shape (B,)
     certain : float64, shape (B,)
-        This probability from the begin of the drive to each node.
+        This probability from the start of the drive to each node.
     """
     falls = _falls(certain)
     out = []
@@ -322,7 +322,7 @@ def heading(windows: Windows, at: NDArray[np.int64], votes: Floats, noises: Sequ
     if total < LEAST_GAIN * len(at):
         return None
     circle = _Chain(windows, at, votes, directions, 4, TEMPER, WIDER)
-    # at the begin of the drive any of the four right angles may be chosen
+    # at the start of the drive any of the four right angles may be chosen
     first = chain.grid[int(chain.smooth(best)[0].sum(0).argmax())]
     start = (np.abs(circle.off(first)) < math.pi / 4).astype(np.float64)
     belief = circle.smooth(best, start)

@@ -21,7 +21,7 @@ from .poses import relative
 from .scans import Scans
 
 EVERY = 8
-"""One window of so many is held out."""
+"""One window of this many is held out."""
 
 NEAR = 4.0
 """Metres around a block within which windows make its map."""

@@ -28,12 +28,12 @@ MOST_WORSE = 1.0
 """Standard errors by which a trajectory may predict readings worse and is still not called worse."""
 
 FIRST, FEWEST_FIRST, CLEAR = 3, 12, 2.0
-"""One block of so many is compared first, if these are so many; the others only if the gain of all blocks is not
-expected to be beyond the thresholds by so many σ. A local map for each block takes most of the time."""
+"""One block of this many is compared first, if these are so many; the others only if the gain of all blocks is not
+expected to be beyond the thresholds by this many σ. A local map for each block takes most of the time."""
 
 TURNED, LEAST_SIGMAS_OF_TURNS = math.radians(8.0), 1.5
-"""A turn within `SPAN` is examined if trajectory and odometry differ by so many radians. Readings there must be
-predicted better by so many standard errors: it is -4 to -6 at corners that are not square, and 2 to 7 with drift."""
+"""A turn within `SPAN` is examined if trajectory and odometry differ by this many radians. Readings there must be
+predicted better by this many standard errors: it is -4 to -6 at corners that are not square, and 2 to 7 with drift."""
 
 
 def gain_over_drive(scans: Scans, before: Floats, after: Floats, watch: Progress) -> Gain:

@@ -23,8 +23,8 @@ LONGEST_STEP = 1.0
 """Metres between two poses of odometry up to which a step is no jump."""
 
 USUAL, TIMES_USUAL, FEWEST_STEPS = 0.9, 2.0, 20
-"""The usual length and speed of steps are this quantile of all; a step may be so many times as long and as fast; fewest
-steps for this quantile."""
+"""The usual length and speed of steps are this quantile of all; a step may be this many times as long and as fast;
+fewest steps for this quantile."""
 
 FEW_STEPS = 5
 """Fewest steps for the median in place of the quantile, which may be a jump if steps are few. With fewer steps, the
@@ -34,13 +34,13 @@ STANDING = 0.01
 """Metres a second up to which the robot stands still: steps are then noise of a filter, and are ignored."""
 
 LONGEST_GAP, TIMES_GAP = 2.0, 4.0
-"""Messages are missing if the time between two poses is more than so many seconds, and so many times the median."""
+"""Messages are missing if the time between two poses is more than this many seconds, and this many times the median."""
 
 AT_ZERO = 0.01
 """Metres, and radians: if odometry is so close to zero after missing messages, its driver was restarted."""
 
 MOMENT, MOVED = 1_000_000_000, 0.05
-"""The robot moves if it moves by so many metres, or radians, in so many nanoseconds before, or after, missing
+"""The robot moves if it moves by this many metres, or radians, in this many nanoseconds before, or after, missing
 messages."""
 
 LONGEST_TURN, FASTEST_TURN = 0.5, 2 * math.pi
@@ -113,7 +113,7 @@ def _moved_around(odometry: Odometry, at: int) -> bool:
 
 
 def _turned_too_fast(turn: Any, seconds: Any) -> Any:
-    """Return whether a turn, radians, is too fast for a robot in so many seconds."""
+    """Return whether a turn, radians, is too fast for a robot in this many seconds."""
     turn = np.abs(wrapped(turn))
     return (turn > LONGEST_TURN) & (turn > FASTEST_TURN * np.asarray(seconds))
 

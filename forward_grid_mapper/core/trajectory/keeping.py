@@ -80,7 +80,7 @@ def keep_if_not_worse(
 
 
 def _same_odometry(correction: Correction, odometry: Odometry) -> bool:
-    """Return whether a correction was made from the begin of this odometry."""
+    """Return whether a correction was made from the start of this odometry."""
     first, known = odometry.stamp[:1], correction.odometry
     if not known.stamp[0] <= first[0] <= known.stamp[-1]:
         return False

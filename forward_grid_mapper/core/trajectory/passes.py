@@ -17,7 +17,7 @@ BLOCK = 4
 """Windows that are matched with one local map."""
 
 BEHIND, BACK = 5.0, 1.2
-"""The first pass matches a block with a map of so many metres before it. The edge begins at the node so many metres
+"""The first pass matches a block with a map of this many metres before it. The edge begins at the node this many metres
 before the block. Metres of progress."""
 
 AROUND = 4.0

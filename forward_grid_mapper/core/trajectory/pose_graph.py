@@ -195,7 +195,7 @@ class Solution:
 
 
 def solution_at(nodes: Floats, calibration: int) -> Solution:
-    """Return nodes as a solution without residuals and samples; the calibration has so many values, all 0."""
+    """Return nodes as a solution without residuals and samples; the calibration has this many values, all 0."""
     return Solution(nodes, np.zeros(calibration), np.zeros(0), np.zeros((0, *nodes.shape)))
 
 

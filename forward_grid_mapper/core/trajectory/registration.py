@@ -1,7 +1,7 @@
 """Registration of a drive with the map of other drives.
 
-A trajectory begins at the first pose of its odometry. An error of the yaw there turns the whole drive about its begin.
-So the drive is moved as a rigid body: the pose of its begin (x, y, yaw) is the one for which its readings are likeliest
+A trajectory begins at the first pose of its odometry. An error of the yaw there turns the whole drive about its start.
+So the drive is moved as a rigid body: the pose of its start (x, y, yaw) is the one for which its readings are likeliest
 on the map of the others. It is searched from coarse to fine; a step of the yaw moves the readings, in the rms, as far
 as a step of the position.
 """
@@ -26,7 +26,7 @@ from .matching import grid_around
 from .poses import compose, relative
 
 SIGMA = np.array([0.1, 0.1, math.radians(4.0)])
-"""σ of the prior of the begin: metres, metres, radians."""
+"""σ of the prior of the start: metres, metres, radians."""
 
 SIGMAS = 2.5
 """Half the size of the first grid, σ; the finer grids may leave it, by up to one of their steps before."""
@@ -56,7 +56,7 @@ class Registration(NamedTuple):
     Attributes
     ----------
     begin : float64, shape (3,)
-        The pose of its begin; unchanged if no better one was found.
+        The pose of its start; unchanged if no better one was found.
     gain : Gain
         How much better its readings are predicted there.
     """
@@ -112,9 +112,9 @@ class OnMap:
         self._extent = _extent(sensors[:, :2])
 
     def search(self, begin: Floats, sigma: Floats, blocks: int = 0) -> Floats:
-        """Return the best pose of the begin near `begin`, shape (3,); `sigma` of the prior is in metres and radians.
+        """Return the best pose of the start near `begin`, shape (3,); `sigma` of the prior is in metres and radians.
 
-        If `blocks` is not 0, the drive is divided into so many blocks, and those that are not on the map are ignored.
+        If `blocks` is not 0, the drive is divided into this many blocks, and those that are not on the map are ignored.
         """
         scan, extent = self._scan, self._extent
         if blocks:
@@ -165,7 +165,7 @@ class OnMap:
 
 
 def _extent(xy: Floats) -> float:
-    """Return the rms distance of readings from the begin of the drive, at least 1 m."""
+    """Return the rms distance of readings from the start of the drive, at least 1 m."""
     return max(float(np.sqrt((xy**2).sum(1).mean())), 1.0)
 
 
@@ -177,6 +177,6 @@ def moved_to(begin: Floats, poses: Floats) -> Floats:
 
 
 def readings_moved(readings: Readings, before: Floats, begin: Floats) -> Readings:
-    """Return the readings of a drive, moved as a rigid body so that its begin goes from `before` to `begin`."""
+    """Return the readings of a drive, moved as a rigid body so that its start goes from `before` to `begin`."""
     sensors = np.stack([readings.x, readings.y, readings.yaw], axis=1)
     return at_poses(readings, compose(begin, relative(before, sensors)))

@@ -64,7 +64,7 @@ LEAST_RECOGNISED = 0.85
 """Fraction of the blocks on an earlier visit that are recognised if the trajectory is not bent."""
 
 MORE_RECOGNISED = 2
-"""So many more blocks must be recognised at another place."""
+"""This many more blocks must be recognised at another place."""
 
 
 def recognised(loops: Sequence[Loop]) -> set[int]:

@@ -27,9 +27,9 @@ from .walls import wall_votes
 from .windows import Windows
 
 LEAST_VOTE_GAIN, LEAST_SIGMAS_WITH_WALLS = 10.0, -1.0
-"""If votes of walls are likelier by so many nats than with the yaw of odometry, beyond what random ranges give, and the
-robot came back to no place, the gain in predicting readings need only be so many standard errors: readings must not be
-predicted worse. Small drift hardly shows within a few metres."""
+"""If votes of walls are likelier by this many nats than with the yaw of odometry, beyond what random ranges give, and
+the robot came back to no place, the gain in predicting readings need only be this many standard errors: readings must
+not be predicted worse. Small drift hardly shows within a few metres."""
 
 LEAST_CERTAINTY = 0.9
 """Least probability that no right angle of the heading was lost."""

@@ -30,7 +30,7 @@ BLUR = 0.4
 """σ added to that of the readings on a coarse grid, in steps of that grid."""
 
 FOLLOWED = (40, 25)
-"""Poses of each coarse grid that are refined: so many near the best one, and as many away from it."""
+"""Poses of each coarse grid that are refined: this many near the best one, and as many away from it."""
 
 NEAR = 0.65
 """Metres within which a pose is near the best one."""

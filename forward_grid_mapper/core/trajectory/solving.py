@@ -58,7 +58,7 @@ NOISE_FACTOR, LEAST_YAW = 2.0, math.radians(1.0)
 metres, so faster drift is not seen. With wheels that slip now and then, the yaw is accurate in between."""
 
 YAW_WEIGHT = EVERY / SPAN
-"""Factor of the loss of measured yaws: each echo votes at so many places, and should count once."""
+"""Factor of the loss of measured yaws: each echo votes at this many places, and should count once."""
 
 SCALE_AND_HEADING = np.array([1.0, 1.0, 0.0, 0.0])
 """Selects the parts of a calibration that do not change the yaw, if this is measured."""
@@ -146,7 +146,7 @@ class MatchSolver:
         found, first = loops_at(scans, moved, stretch, usual), int(stretch[0])
         if len(found) < len(recognised(loops).intersection(blocks.tolist())) + MORE_RECOGNISED:
             return solution, loops
-        # without the loop closures that tie what comes after the begin of the stretch to what lies before it
+        # without the loop closures that tie what comes after the start of the stretch to what lies before it
         across = [min(loop.block, loop.place) < first <= max(loop.block, loop.place) for loop in loops]
         rest = [loop for loop, out in zip(loops, across, strict=True) if not out]
         tried, kept = self._with_loops(self._walls(nodes, True), matches, [*rest, *found], solution)

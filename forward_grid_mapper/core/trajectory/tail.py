@@ -21,7 +21,7 @@ class Tail(NamedTuple):
     Attributes
     ----------
     odometry : Odometry
-        From the begin of the first window on.
+        From the start of the first window on.
     readings : Readings
         Of the complete windows, without those at standstill: there may be hours of them, and each step would sort them
         out again.

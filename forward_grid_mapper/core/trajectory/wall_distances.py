@@ -54,7 +54,7 @@ GATE_PER_METRE = 0.03
 """The same for each metre of progress without a measurement of the wall."""
 
 STEP, LONGEST_GAP = 1.2, 3.7
-"""Metres of progress between blocks; after so many without a measurement, a wall is a new one."""
+"""Metres of progress between blocks; after this many without a measurement, a wall is a new one."""
 
 LEAST_SIGMA, FIRST_SIGMA = 0.015, 0.04
 """Smallest σ of a distance, metres, because of cells and small objects at the wall; and for rough nodes."""

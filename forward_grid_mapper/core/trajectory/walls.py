@@ -60,7 +60,7 @@ CHANCE = 2.0
 """Standard deviations of the number of echoes of a bin by chance that are subtracted, beside its mean."""
 
 POINT = 2.0
-"""Echoes count if their variance along the wall is more than so many times that of an object."""
+"""Echoes count if their variance along the wall is more than this many times that of an object."""
 
 THING = 0.5**2 / 12
 """Variance of points on an object of half a metre, m²: it has sides but is no wall."""
@@ -70,12 +70,12 @@ TENTHS = 3600
 the same."""
 
 BESIDE, COUNTS = math.radians(30.0), 0.5
-"""If no sensor looks straight to a side, the normal of a wall may lie up to so many radians beside a cone, and such an
-echo has this weight. With a sensor to a side, votes are sharper without such echoes."""
+"""If no sensor looks straight to a side, the normal of a wall may lie up to this many radians beside a cone, and such
+an echo has this weight. With a sensor to a side, votes are sharper without such echoes."""
 
 WELL_INSIDE = 30
-"""A sensor looks straight to a side if this direction is at least so many tenths of a degree inside of its cone, since
-yaws vary."""
+"""A sensor looks straight to a side if this direction is at least this many tenths of a degree inside of its cone,
+since yaws vary."""
 
 USUAL = 0.05
 """Fraction of the median number of votes that is added to all directions of a place: without it, places where hardly

@@ -41,7 +41,7 @@ def nodes_of(values: Floats) -> Floats:
 
 
 def values_of(sigmas: float, seed: int, count: int = WINDOWS) -> Floats:
-    """Return values of windows whose mean is so many standard errors of JUDGED_ON of them above 0."""
+    """Return values of windows whose mean is this many standard errors of JUDGED_ON of them above 0."""
     return np.random.default_rng(seed).normal(sigmas / np.sqrt(JUDGED_ON), 1.0, count)
 
 

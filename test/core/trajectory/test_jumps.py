@@ -87,7 +87,7 @@ def off(exact: Recording, path: Odometry) -> float:
 
 
 def with_few_poses(readings: Readings, odometry: Odometry, metres: float) -> tuple[Readings, Odometry]:
-    """The drive with odometry only once in so many metres."""
+    """The drive with odometry only once in this many metres."""
     travel, stay = odometry.travel, [0]
     for k in range(1, len(travel)):
         if travel[k] - travel[stay[-1]] >= metres or k == len(travel) - 1:

@@ -62,7 +62,7 @@ def test_long_step_is_a_jump_for_a_slow_robot(far: float, seconds: float, jump: 
 
 
 def with_gap(far: float, seconds: float, rate: float, before: float, after: float) -> Odometry:
-    """Odometry of a robot that drives 0.5 m/s, except in so many seconds before and after a step of `far` metres."""
+    """Odometry of a robot that drives 0.5 m/s, except in this many seconds before and after a step of `far` metres."""
     count, stand, moves = round(60 * rate), [round(lasts * rate) for lasts in (before, after)], 0.5 / rate
     x = [np.r_[np.arange(count) * moves, np.full(stand[0], (count - 1) * moves)]]
     x.append(x[0][-1] + far + np.r_[np.zeros(stand[1]), np.arange(count) * moves])

@@ -39,7 +39,7 @@ def matched(scans: Scans) -> Floats:
 
 
 def off_after(nodes: Floats, true: Floats, apart: int = 12) -> Floats:
-    """Error of the motion over so many windows: metres, metres and radians."""
+    """Error of the motion over this many windows: metres, metres and radians."""
     off = relative(relative(true[:-apart], true[apart:]), relative(nodes[:-apart], nodes[apart:]))
     off[:, 2] = (off[:, 2] + math.pi) % (2 * math.pi) - math.pi
     return off
