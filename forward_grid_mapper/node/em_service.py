@@ -14,6 +14,7 @@ from ..files.quality_warning import quality_warning
 from .background import Inbox, reason
 from .consistency_check import ConsistencyCheck
 from .deferred import Reply
+from .distance import jump_warnings
 from .em import EmWorker, Outcome, Run, summary
 from .kernels import Kernels
 from .map_publishers import MapPublishers
@@ -22,7 +23,7 @@ from .online import OnlineWorker
 from .refining import Found, RefiningMapper
 from .run_input import RunInput
 from .sensor_status import SensorWatch
-from .trajectory import Trajectory, jump_warnings
+from .trajectory import Trajectory
 
 LOG_PERIOD = 10.0
 """Seconds between two lines of progress in the log while the trajectory is estimated."""

@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from diagnostic_msgs.msg import DiagnosticStatus
@@ -22,14 +22,13 @@ from ..core.maps.log_odds_map import LogOddsMap
 from ..core.messages.message_types import Pose2
 from ..core.messages.pose_association import PoseAssociator
 from ..core.trajectory.correction import Correction
-from ..core.trajectory.jumps import MOST_JUMPS, jumps, may_jump
 from ..core.trajectory.refinable import SHORTEST
-from ..core.trajectory.windows import STILL, Odometry
-from ..files.quality_warning import jumps_warning
+from ..core.trajectory.windows import Odometry
 from ..files.report_text import UNTESTED
 from ..files.trajectory_text import calibration_words
 from .background import Worker
 from .diagnostics import status
+from .distance import Distance
 from .following import Following
 from .pose_publishers import PERIOD, PosePublishers
 from .refining import Drive, Found, RefiningMapper, outcome_words
@@ -44,9 +43,6 @@ LASTING = 1.0
 PATH_EVERY = 0.5
 """Metres of driving between two messages of the path."""
 
-RECENT = 60_000_000_000
-"""Nanoseconds of odometry before the last check, from which the usual distance of its poses follows."""
-
 AFTER_JUMP = SHORTEST
 """Metres after a jump of odometry at which the node refines by itself, if `refine_every` is set: enough to find the
 pose of the robot."""
@@ -60,30 +56,6 @@ equal distances runs would cost more and more."""
 
 JUMPED_BACK = 'the clock jumped back'
 """The reason why following ends; after it, stamps are those of an earlier part of the drive."""
-
-
-class _Jump(NamedTuple):
-    """A jump of odometry: the stamp after it, nanoseconds; its size, and the distance driven before it, metres."""
-
-    stamp: int
-    far: float
-    driven: float
-
-    def __str__(self) -> str:
-        return (
-            f'odometry jumped by {self.far:.1f} m: the pose of the robot on the map is unknown until run_em has found '
-            'it, and new readings are mapped with wrong poses; if the robot was carried away (kidnapped), call reset'
-        )
-
-
-def jump_warnings(odometry: Odometry) -> list[str]:
-    """Return a warning if odometry jumps, for maps along it; not if it seems to consist of jumps."""
-    at = jumps(odometry)
-    if len(at) > MOST_JUMPS:
-        return []
-    steps = np.hypot(*np.diff(odometry.pose[:, :2], axis=0).T)
-    remedy = 'set refine_poses, which corrects this from the readings, or call reset after a jump'
-    return list(filter(None, [jumps_warning(steps, (at - 1).tolist(), remedy)]))
 
 
 class Trajectory:
@@ -108,8 +80,8 @@ class Trajectory:
         Returns whether the node is active: an inactive node leaves the transform to others, such as AMCL.
     following : Following or None
         Continues the trajectory while the robot drives; None if this is not wanted.
-    driven : float
-        Metres since the start of the drive, up to the last check; without noise of odometry while the robot stands.
+    distance : Distance
+        Driven since the start of the drive.
     """
 
     def __init__(self, node: Any, associator: PoseAssociator, clock: Any) -> None:
@@ -125,11 +97,9 @@ class Trajectory:
         self.refine: Callable[[], bool] = lambda: False
         self.listening: Callable[[], bool] = lambda: True
         self.following: Following | None = None
-        self.driven = self._refined_at = self._shown_at = 0.0
-        self._at: tuple[int, Pose2] | None = None
-        self._counted: Pose2 | None = None
+        self.distance = Distance(associator.record)
+        self._refined_at = self._shown_at = 0.0
         self._ahead: tuple[int, float] | None = None
-        self._jump: _Jump | None = None
         self._since = -1
         self._showing = False
         self._foreign: int | None = None
@@ -175,8 +145,8 @@ class Trajectory:
         self.correction = self.found = None
         if self.following is not None:
             self.following.begin(None)
-        self.driven = self._refined_at = self._shown_at = 0.0
-        self._at = self._counted = self._jump = None
+        self.distance = Distance(self._associator.record)
+        self._refined_at = self._shown_at = 0.0
         newest = self._associator.record.newest
         # the path begins with the drive
         self._since = -1 if newest is None else newest[0]
@@ -190,7 +160,7 @@ class Trajectory:
         self, parameters: Parameters, drive: Callable[[], Drive], now: Callable[[], Drive]
     ) -> RefiningMapper | Mapper:
         """Return a mapper for a run; `drive` returns the drive at its start, `now` the drive so far."""
-        self._refined_at, self._before_run = self.driven, self._associator.time_jumps
+        self._refined_at, self._before_run = self.distance.driven, self._associator.time_jumps
         refine, before = parameters.node.refine_poses and not self.obstacle, None
         if self.found is not None and self.correction is not None:
             before = self.found._replace(correction=self.correction)
@@ -205,9 +175,8 @@ class Trajectory:
         # the live map and the follower have other owners
         self.found = found._replace(live=None, follower=None) if found and found.refinement else None
         refinement = found.refinement if found else None
-        looked_at = refinement.trajectory.stamp[-1:] if refinement else np.zeros(0, np.int64)
-        if self._jump is not None and (looked_at >= self._jump.stamp).any():
-            self._jump = None
+        if refinement and len(refinement.trajectory.stamp):
+            self.distance.explain(int(refinement.trajectory.stamp[-1]))
         if self.correction is not None:
             self._explained = self._before_run
         if self.following is not None:
@@ -241,7 +210,7 @@ class Trajectory:
             'map frame': self.frame,
             'transform': self._transform(),
             'poses of odometry kept': self._associator.record.since_anew,
-            'driven since the latest run (m)': f'{self.driven - self._refined_at:.1f}',
+            'driven since the latest run (m)': f'{self.distance.driven - self._refined_at:.1f}',
         }
         refinement = self.found.refinement if self.found else None
         if refinement is not None and self.correction is not None:
@@ -258,8 +227,8 @@ class Trajectory:
         if self.following is not None:
             values |= self.following.values()
         message = self.outcome() or 'odometry is used until run_em is called'
-        if self._jump is not None:
-            message = f'{message}; {self._jump}'
+        if self.distance.jump is not None:
+            message = f'{message}; {self.distance.jump}'
         if self._jumped_back:
             message = (
                 f'{message}; {JUMPED_BACK}, and the odometry before it is gone: call reset to begin a new map, or, if '
@@ -268,7 +237,7 @@ class Trajectory:
         troubled = (
             self.obstacle
             or (self.following is not None and self.following.obstacle)
-            or self._jump is not None
+            or self.distance.jump is not None
             or self._jumped_back
             or (refinement is not None and refinement.unplaced)
         )
@@ -316,7 +285,7 @@ class Trajectory:
             return
         if associator.time_jumps != self._jumps:
             self._jumps, self._since = associator.time_jumps, -1
-            self._at = self._counted = self._jump = None
+            self.distance.forget()
             self._out.forget()
             if self.following is not None and self._jumped_back:
                 self.following.end(JUMPED_BACK)
@@ -341,47 +310,22 @@ class Trajectory:
 
     def _advance(self, stamp: int, pose: Pose2) -> None:
         """Update the distance driven, and do the work that is due."""
-        before, self._at = self._at or (stamp, pose), (stamp, pose)
-        self._add_distance(before, pose)
+        jump = self.distance.add(stamp, pose)
+        if jump is not None and self._parameters.node.refine_poses:
+            self._node.get_logger().warning(str(jump))
         if self.following is not None:
             self.following.offer(pose, lambda: (self._associator.buffer.snapshot(), self._associator.record.snapshot()))
-        if self.driven - self._shown_at >= PATH_EVERY and not self._showing:
+        if self.distance.driven - self._shown_at >= PATH_EVERY and not self._showing:
             self._show_path()
         every = self._parameters.node.refine_every
         if not every or not self._parameters.node.refine_poses:
             return
-        due = max(every, LEAST_EVERY, NEW_PART * self.driven) <= self.driven - self._refined_at
-        if self._jump is not None and self._jump.driven >= self._refined_at:
-            due = due or self.driven - self._jump.driven >= AFTER_JUMP
+        due = max(every, LEAST_EVERY, NEW_PART * self.distance.driven) <= self.distance.driven - self._refined_at
+        jump = self.distance.jump
+        if jump is not None and jump.driven >= self._refined_at:
+            due = due or self.distance.driven - jump.driven >= AFTER_JUMP
         if due and self.refine():
-            self._refined_at = self.driven
-
-    def _add_distance(self, before: tuple[int, Pose2], pose: Pose2) -> None:
-        """Add the distance driven since the last check, without jumps; many messages may have arrived since."""
-        if may_jump(Odometry(*self._associator.record.since(before[0]))) and self._add_jump(before[0]):
-            self._counted = pose
-            return
-        # odometry of a robot that stands may be noisy: it would drive 100 m in an hour at a dock
-        self._counted = self._counted or before[1]
-        far = math.dist(self._counted[:2], pose[:2])
-        if far >= STILL:
-            self.driven, self._counted = self.driven + far, pose
-
-    def _add_jump(self, before: int) -> bool:
-        """Add the distance driven since a stamp, if odometry jumped after it; return whether it did."""
-        recent = Odometry(*self._associator.record.since(before - RECENT))
-        first, at = int(np.searchsorted(recent.stamp, before)), jumps(recent)
-        at = at[at > first]
-        if not len(at):
-            return False
-        steps = np.hypot(*np.diff(recent.pose[:, :2], axis=0).T)
-        far, last = float(steps[at[-1] - 1]), int(at[-1])
-        steps[:first], steps[at - 1] = 0.0, 0.0
-        begin, self.driven = self.driven + float(steps[:last].sum()), self.driven + float(steps.sum())
-        known, self._jump = self._jump is not None, _Jump(int(recent.stamp[last]), far, begin)
-        if self._parameters.node.refine_poses and not known:
-            self._node.get_logger().warning(str(self._jump))
-        return True
+            self._refined_at = self.distance.driven
 
     def _show_path(self) -> None:
         """Have the trajectory published, continued by poses of odometry in the map frame."""
@@ -394,7 +338,7 @@ class Trajectory:
             return
         # snapshots are immutable
         stamps, poses = self._associator.record.snapshot()
-        self._shown_at, self._showing = self.driven, True
+        self._shown_at, self._showing = self.distance.driven, True
 
         def publish() -> None:
             self._showing = False

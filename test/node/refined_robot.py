@@ -73,4 +73,4 @@ def assert_live(robot: Inside, bent: Odometry | None) -> None:
 def begin(robot: Inside) -> None:
     """Let the node receive the first messages of the drive."""
     robot.drive(0, 1)
-    robot.until(lambda: robot.node.trajectory._at is not None)
+    robot.until(lambda: robot.node.trajectory.distance._newest is not None)

@@ -15,7 +15,7 @@ from inside import Inside
 from refined_robot import begin, odometry_of
 
 from forward_grid_mapper.core.trajectory.poses import compose
-from forward_grid_mapper.node import trajectory
+from forward_grid_mapper.node import distance, trajectory
 
 OK, WARN = b'\x00', b'\x01'
 
@@ -28,7 +28,7 @@ def test_node_refines_after_the_distance_of_refine_every(
     node = robot.node
     begin(robot)
     robot.drive(1, 59)
-    robot.until(lambda: node.trajectory.driven > 0.05)
+    robot.until(lambda: node.trajectory.distance.driven > 0.05)
     assert node.em.current is None and node.em.maps is None, 'it has not driven far enough'
     robot.drive(60, 80)
     robot.until(lambda: node.em.maps is not None and node.em.current is None)
@@ -37,13 +37,13 @@ def test_node_refines_after_the_distance_of_refine_every(
     assert 'trajectory refined' in node.em.last_run
     first = node.em.maps
     robot.drive(140, 20)
-    robot.until(lambda: node.trajectory._at[1].x > 0.158)
+    robot.until(lambda: node.trajectory.distance._newest[1].x > 0.158)
     assert node.em.maps is first and node.em.current is None
     robot.drive(160, 120)
     robot.until(lambda: node.em.maps is not first and node.em.current is None)
     # a service call restarts the distance
     assert robot.call(node.em.run_em)[0]
-    assert node.trajectory.driven - node.trajectory._refined_at < 0.05
+    assert node.trajectory.distance.driven - node.trajectory._refined_at < 0.05
 
 
 def test_node_refines_soon_after_a_jump(
@@ -54,7 +54,7 @@ def test_node_refines_soon_after_a_jump(
     node = robot.node
     begin(robot)
     robot.drive(1, 149)
-    robot.until(lambda: node.trajectory.driven > 0.14)
+    robot.until(lambda: node.trajectory.distance.driven > 0.14)
     assert node.em.current is None and node.em.maps is None
     # from 0.15 m to 5.15 m
     for k in range(150, 300):
@@ -62,7 +62,7 @@ def test_node_refines_soon_after_a_jump(
         robot.range(100.0 + 0.05 * k)
     robot.until(lambda: node.em.maps is not None and node.em.current is None)
     first = node.em.maps
-    robot.until(lambda: node.trajectory._at[1].x > 5.298)
+    robot.until(lambda: node.trajectory.distance._newest[1].x > 5.298)
     assert node.em.maps is first and node.em.current is None, 'once is enough'
 
 
@@ -72,12 +72,12 @@ def test_noise_of_odometry_at_standstill_is_no_driving(inside: Callable[..., Ins
     for k, off in enumerate(noise.tolist()):
         robot.odometry(100.0 + 0.05 * k, off)
         trajectory._tick()
-    assert trajectory.driven == 0.0 and np.abs(np.diff(noise)).sum() > 2.0
+    assert trajectory.distance.driven == 0.0 and np.abs(np.diff(noise)).sum() > 2.0
     # a robot that creeps at 2 mm/s drives nevertheless
     for k in range(5000):
         robot.odometry(200.0 + 0.05 * k, 0.0001 * k)
         trajectory._tick()
-    assert trajectory.driven == pytest.approx(0.5, abs=0.02)
+    assert trajectory.distance.driven == pytest.approx(0.5, abs=0.02)
 
 
 def test_usual_steps_of_odometry_are_only_looked_up_after_a_long_step(
@@ -85,8 +85,8 @@ def test_usual_steps_of_odometry_are_only_looked_up_after_a_long_step(
 ) -> None:
     robot = inside(refine_poses=True).start()
     sizes: list[int] = []
-    find = trajectory.jumps
-    monkeypatch.setattr(trajectory, 'jumps', lambda odometry: sizes.append(len(odometry.stamp)) or find(odometry))
+    find = distance.jumps
+    monkeypatch.setattr(distance, 'jumps', lambda odometry: sizes.append(len(odometry.stamp)) or find(odometry))
     for k in range(2000):
         robot.odometry(100.0 + 0.001 * k, 0.0005 * k)
         if k % 50 == 0:
@@ -94,14 +94,14 @@ def test_usual_steps_of_odometry_are_only_looked_up_after_a_long_step(
     assert not sizes, 'at 1 kHz, the last minute has 60 000 poses'
     robot.odometry(102.0, 9.0)
     robot.node.trajectory._tick()
-    assert sizes == [2001] and robot.node.trajectory._jump is not None
+    assert sizes == [2001] and robot.node.trajectory.distance.jump is not None
 
 
 def test_node_does_not_refine_at_each_step(inside: Callable[..., Inside], quick: Any) -> None:
     robot = inside(refine_poses=True, refine_every=1e-9).start()
     begin(robot)
     robot.drive(1, 100)
-    robot.until(lambda: robot.node.trajectory.driven > 0.095)
+    robot.until(lambda: robot.node.trajectory.distance.driven > 0.095)
     assert robot.node.em.current is None and robot.node.em.maps is None
 
 
@@ -114,7 +114,7 @@ def test_node_does_not_refine_without_refine_every(
         begin(robot)
     robot.drive(1, 100)
     if not options:
-        robot.until(lambda: robot.node.trajectory.driven > 0.095)
+        robot.until(lambda: robot.node.trajectory.distance.driven > 0.095)
     assert robot.node.em.current is None and robot.node.em.maps is None
 
 

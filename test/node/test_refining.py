@@ -212,7 +212,7 @@ def test_node_returns_to_odometry_if_it_is_better(
 def test_jump_of_odometry_gives_a_warning_until_the_next_run(inside: Callable[..., Inside], quick: Any) -> None:
     robot, _ = refined(inside(refine_poses=True).start())
     node = robot.node
-    robot.until(lambda: node.trajectory._at is not None)
+    robot.until(lambda: node.trajectory.distance._newest is not None)
     assert robot.status('trajectory')['level'] == OK
     robot.odometry(111.0, 9.0)
     robot.odometry(111.05, 9.0)
@@ -220,7 +220,7 @@ def test_jump_of_odometry_gives_a_warning_until_the_next_run(inside: Callable[..
     message = robot.status('trajectory')['message']
     assert 'trajectory refined' in message and 'odometry jumped by 8.8 m' in message
     assert 'run_em' in message and 'reset' in message
-    assert node.trajectory.driven < 1.0, 'nobody drove that'
+    assert node.trajectory.distance.driven < 1.0, 'nobody drove that'
     robot.range(111.02)
     robot.until(lambda: not node.intake.busy)
     assert robot.call(node.em.run_em)[0]
@@ -238,20 +238,22 @@ def test_jump_with_rare_odometry_is_detected_by_the_last_minute(inside: Callable
     for k in range(40):
         x += 0.54 if k % 8 else 1.08
         robot.odometry(100.0 + 0.9 * k, x)
-        robot.until(lambda x=x: trajectory._at is not None and trajectory._at[1].x == x)
+        robot.until(lambda x=x: trajectory.distance._newest is not None and trajectory.distance._newest[1].x == x)
     driven = x - 1.08
-    assert trajectory._jump is None and trajectory.driven == pytest.approx(driven)
+    assert trajectory.distance.jump is None and trajectory.distance.driven == pytest.approx(driven)
     for k, step in enumerate((0.54, 2.5), 40):
         x += step
         robot.odometry(100.0 + 0.9 * k, x)
-        robot.until(lambda x=x: trajectory._at[1].x == x)
+        robot.until(lambda x=x: trajectory.distance._newest[1].x == x)
     assert 'odometry jumped by 2.5 m' in robot.status('trajectory')['message']
-    assert trajectory.driven == pytest.approx(driven + 0.54), 'nobody drove that, and the way before counts once'
+    assert trajectory.distance.driven == pytest.approx(driven + 0.54), (
+        'nobody drove that, and the way before counts once'
+    )
     # as after a run that has examined it
-    trajectory._jump = None
+    trajectory.distance.jump = None
     robot.odometry(100.0 + 0.9 * 42, x + 0.54)
-    robot.until(lambda: trajectory._at[1].x == x + 0.54)
-    assert trajectory._jump is None and trajectory.driven == pytest.approx(driven + 1.08)
+    robot.until(lambda: trajectory.distance._newest[1].x == x + 0.54)
+    assert trajectory.distance.jump is None and trajectory.distance.driven == pytest.approx(driven + 1.08)
 
 
 def test_part_that_could_not_be_placed_gives_a_warning(
