@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from ..common.readings import Floats
 from .likelihood import scores
+from .passes import Progress
 from .poses import relative
 from .scans import Scans
 
@@ -45,7 +46,13 @@ def held_out(count: int) -> NDArray[np.bool_]:
     return out
 
 
-def predicted(scans: Scans, nodes: Floats, blocks: list[NDArray[np.int64]], span: float = np.inf) -> Floats:
+def predicted(
+    scans: Scans,
+    nodes: Floats,
+    blocks: list[NDArray[np.int64]],
+    span: float = np.inf,
+    watch: Progress = lambda part: None,
+) -> Floats:
     """Return the mean log-likelihood ratio of the readings of each block, shape (n,), nats; NaN if it has no map.
 
     Parameters
@@ -56,12 +63,15 @@ def predicted(scans: Scans, nodes: Floats, blocks: list[NDArray[np.int64]], span
         Windows of each; they are left out of the map of their block.
     span : float
         Metres of progress before and after a block within which windows make its map.
+    watch : callable
+        Receives the fraction of the work that is done.
     """
     along = hashlib.sha256(nodes.tobytes()).digest()
     out = np.empty(len(blocks))
     for i, block in enumerate(blocks):
         key = along, block.tobytes(), span
         if key not in scans.predictions:
+            watch(i / len(blocks))
             scans.predictions[key] = _predicted(scans, nodes, block, span)
         out[i] = scans.predictions[key]
     return out

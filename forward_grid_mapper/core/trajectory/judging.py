@@ -52,11 +52,14 @@ def gain_over_drive(scans: Scans, before: Floats, after: Floats, watch: Progress
     return _compared(scans, before, after, blocks, (-MOST_WORSE, LEAST_SIGMAS), SPAN, watch)
 
 
-def gain_at_revisits(scans: Scans, before: Floats, after: Floats) -> Gain:
-    """Return the gain of one trajectory over another in predicting held-out windows, on maps of all visits."""
+def gain_at_revisits(scans: Scans, before: Floats, after: Floats, watch: Progress = lambda part: None) -> Gain:
+    """Return the gain of one trajectory over another in predicting held-out windows, on maps of all visits.
+
+    The parameters are those of `gain_over_drive`.
+    """
     # the only proof in this case, so all held-out windows are used
     blocks = held_out_blocks(scans, len(before))
-    return gain(predicted(scans, before, blocks), predicted(scans, after, blocks))
+    return _gain(scans, before, after, blocks, np.inf, watch)
 
 
 def last_not_worse(scans: Scans, first: Floats, *others: Floats) -> Floats:
@@ -88,15 +91,22 @@ def _compared(
 
     The others are as in `predicted` and `gain_over_drive`.
     """
-    first = blocks[::FIRST]
+    first, done = blocks[::FIRST], 0.0
     if len(first) >= FEWEST_FIRST:
-        better = gain(predicted(scans, before, first, span), predicted(scans, after, first, span))
         more = len(blocks) / len(first)
+        better = _gain(scans, before, after, first, span, lambda part: watch(part / more))
         expected, margin = math.sqrt(more) * better.sigmas, CLEAR * math.sqrt(more - 1.0)
         if not thresholds[0] - margin < expected < thresholds[1] + margin:
             return better
-        watch(1.0 / more)
-    return gain(predicted(scans, before, blocks, span), predicted(scans, after, blocks, span))
+        done = 1.0 / more
+    return _gain(scans, before, after, blocks, span, lambda part: watch(max(part, done)))
+
+
+def _gain(
+    scans: Scans, before: Floats, after: Floats, blocks: list[NDArray[np.int64]], span: float, watch: Progress
+) -> Gain:
+    first = predicted(scans, before, blocks, span, lambda part: watch(part / 2))
+    return gain(first, predicted(scans, after, blocks, span, lambda part: watch((1.0 + part) / 2)))
 
 
 def gain_of_objective(scans: Scans, before: Floats, after: Floats) -> Gain:

@@ -150,7 +150,7 @@ class Refiner:
         moved, turned = differences(odometry, trajectory)
         if moved < least_moved:
             return _without_better(by_walls.refinement)
-        better = gain_at_revisits(scans, windows.node, nodes)
+        better = gain_at_revisits(scans, windows.node, nodes, self._start_stage('judgement'))
         if better.sigmas < LEAST_SIGMAS:
             return _without_better(by_walls.refinement)
         if known is None and (walls := self._by_walls_after_all(drive, by_walls, nodes, least_moved)) is not None:

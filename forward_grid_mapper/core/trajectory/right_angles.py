@@ -127,8 +127,9 @@ def at_right_angles(
     odometry_is_wrong : bool
         Whether this is known, so that the trajectory need not show it.
     """
-    start_stage('directions of walls')
-    found_heading, vote_gain = heading_of_walls(drive.windows, drive.scans, odometry_noise)
+    found_heading, vote_gain = heading_of_walls(
+        drive.windows, drive.scans, odometry_noise, start_stage('directions of walls')
+    )
     if found_heading is None:
         return _kept(drive, NO_WALLS)
     solver_of = partial(_solver_of, drive, start_stage)
@@ -142,9 +143,9 @@ def at_right_angles(
     found = solve_hypotheses(drive.scans, walls.heading, walls.solver, walls.along, solver_of)
     if found.certainty < LEAST_CERTAINTY:
         return _heading_lost(drive, found.certainty)
-    start_stage('judgement')
+    watch = start_stage('judgement')
     best = _best_of(drive, walls, found)
-    verdict = walls.verdict if walls.proven else _at_revisits(drive, walls, best.nodes)
+    verdict = walls.verdict if walls.proven else _at_revisits(drive, walls, best.nodes, watch)
     attempt = _accepted(drive, best, verdict, walls.heading.drifts.noise, least_moved)
     if verdict.accepted or odometry_is_wrong:
         return attempt
@@ -152,7 +153,9 @@ def at_right_angles(
     return _unproven(drive, walls, verdict)._replace(unproven=unproven)
 
 
-def heading_of_walls(windows: Windows, scans: Scans, odometry_noise: float) -> tuple[Heading | None, float]:
+def heading_of_walls(
+    windows: Windows, scans: Scans, odometry_noise: float, watch: Progress = lambda part: None
+) -> tuple[Heading | None, float]:
     """Return the heading from walls, and by how many nats votes are likelier than with the yaw of odometry.
 
     The same gain of random ranges is subtracted.
@@ -161,6 +164,7 @@ def heading_of_walls(windows: Windows, scans: Scans, odometry_noise: float) -> t
     found = heading(windows, *wall_votes(windows, scans.held_out), noises)
     if found is None:
         return None, 0.0
+    watch(0.5)
     # a robot that drives and looks along two axes gets votes for these even with random ranges
     readings, rng = windows.readings, np.random.default_rng(0)
     drawn = np.where(readings.echo, rng.random(len(readings)) * readings.z_max, readings.z)
@@ -219,7 +223,7 @@ def _unproven(drive: Drive, walls: _AlongWalls, verdict: _Verdict) -> Attempt:
     return _kept(drive, verdict.words + NOT_ENOUGH, walls.calibration, verdict.gain.mean, agrees)
 
 
-def _at_revisits(drive: Drive, walls: _AlongWalls, nodes: Floats) -> _Verdict:
+def _at_revisits(drive: Drive, walls: _AlongWalls, nodes: Floats, watch: Progress) -> _Verdict:
     """Judge refined nodes where the robot came back, or by votes of walls if it did not.
 
     Revisits show drift over the whole drive, and walls that are not parallel. Whether the robot came back is decided
@@ -228,7 +232,7 @@ def _at_revisits(drive: Drive, walls: _AlongWalls, nodes: Floats) -> _Verdict:
     revisited = has_revisits(drive.scans, nodes)
     if not revisited and not walls.votes_suffice:
         return walls.verdict
-    better = gain_at_revisits(drive.scans, drive.windows.node, nodes)
+    better = gain_at_revisits(drive.scans, drive.windows.node, nodes, watch)
     words = gain_words(better)
     if revisited:
         return _Verdict(better.sigmas >= LEAST_SIGMAS, better, f'where the robot came back, {words}')

@@ -12,7 +12,7 @@ from forward_grid_mapper.core.common.readings import Floats
 from forward_grid_mapper.core.trajectory import judging
 from forward_grid_mapper.core.trajectory.holding_out import EVERY, FEWEST_BLOCKS, gain, held_out
 from forward_grid_mapper.core.trajectory.judging import CLEAR, FIRST, HELD_OUT, JUDGED_ON, gain_over_drive
-from forward_grid_mapper.core.trajectory.passes import BLOCK
+from forward_grid_mapper.core.trajectory.passes import BLOCK, Progress
 from forward_grid_mapper.core.trajectory.scans import Scans
 
 WINDOWS = EVERY * HELD_OUT
@@ -27,7 +27,11 @@ class Prediction:
         self.blocks: set[int] = set()
         monkeypatch.setattr(judging, 'predicted', self.predicted)
 
-    def predicted(self, scans: object, nodes: Floats, blocks: list[NDArray[np.int64]], span: float = np.inf) -> Floats:
+    def predicted(
+        self, scans: object, nodes: Floats, blocks: list[NDArray[np.int64]], span: float, watch: Progress
+    ) -> Floats:
+        for done in range(2):
+            watch(done / 2)
         self.blocks.update(int(block[0]) for block in blocks)
         return np.array([nodes[block[0], 0] for block in blocks])
 
@@ -112,3 +116,14 @@ def test_decision_by_a_third_is_seldom_another_than_by_all(monkeypatch: pytest.M
         taken = judging.last_not_worse(prediction.scans, first, nodes_of(values)) is not first
         differ += taken != (gain(np.zeros(HELD_OUT), values[chosen]).sigmas > -judging.MOST_WORSE)
     assert differ <= 200 // 40
+
+
+def test_progress_of_the_judgement_grows_from_0_to_1(monkeypatch: pytest.MonkeyPatch) -> None:
+    prediction, told = Prediction(monkeypatch), list[float]()
+    before, after = nodes_of(np.zeros(WINDOWS)), nodes_of(values_of(1.0, 1))
+    gain_over_drive(prediction.scans, before, after, told.append)
+    # of a third of the blocks, which do not decide, and then of all
+    np.testing.assert_allclose(told, [0.0, 1 / 12, 1 / 6, 1 / 4, 1 / 3, 1 / 3, 1 / 2, 3 / 4])
+    told.clear()
+    judging.gain_at_revisits(prediction.scans, before, after, told.append)
+    assert told == [0.0, 0.25, 0.5, 0.75]
