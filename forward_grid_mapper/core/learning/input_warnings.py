@@ -41,7 +41,9 @@ DIFFERS = 0.3
 
 AS_BEFORE = 0.05
 """Steps between readings during which the sensor turned by more, radians, are ignored: a sensor on a servo, or on a
-robot that spins, detects the same objects periodically."""
+robot that spins, detects the same objects periodically. So are steps in which it moved by more than `DIFFERS`: sensors
+that share a frame measure from one place, and after a jump back of the clock, readings of two places alternate.
+"""
 
 STANDS = 8.0
 """Shortest standstill whose ranges are checked, seconds."""
@@ -69,6 +71,10 @@ longest pause before."""
 
 FASTEST = 15.0
 """No robot with sonars drives this many metres a second; 0.2 m/s in centimetres look like 20 m/s."""
+
+NEXT = 4
+"""The slowest of the ways to so many next readings of a sensor counts: after a jump back of the clock, readings of two
+places alternate, and one of the next was measured a moment later."""
 
 HANDFUL, SWEEPS = 0.02, 2
 """Largest fraction of the readings, and of rounds of all sensors, that should not make the map much larger; one wrong
@@ -130,9 +136,10 @@ def _shared_frame(readings: Readings) -> str:
     suspects = []
     for name, mine in sensors(readings):
         z = mine.z
-        follows = mine.stamp[1:] == mine.stamp[:-1]
-        at_once = np.count_nonzero(follows & (np.abs(np.diff(z)) > DIFFERS)) > AT_ONCE * len(z)
-        steps = np.abs(np.diff(z))[turned(mine) <= AS_BEFORE]
+        one_pose = (turned(mine) <= AS_BEFORE) & (np.hypot(np.diff(mine.x), np.diff(mine.y)) <= DIFFERS)
+        differ = (mine.stamp[1:] == mine.stamp[:-1]) & (np.abs(np.diff(z)) > DIFFERS)
+        at_once = np.count_nonzero(differ & one_pose) > AT_ONCE * len(z)
+        steps = np.abs(np.diff(z))[one_pose]
         neighbours = float(np.quantile(steps, 0.75)) if len(steps) else 0.0
         periods = range(3, min(LONGEST_PERIOD, len(z) // 10) + 1)
         rounds = [float(np.quantile(np.abs(z[k:] - z[:-k]), 0.75)) for k in periods]
@@ -152,10 +159,15 @@ def _speed(readings: Readings) -> str:
     """Check for poses in other units than metres: most of the time, the robot seems to drive far too fast."""
     speeds = []
     for _, mine in sensors(readings):
-        seconds = np.diff(mine.stamp) / 1e9
-        way = np.hypot(np.diff(mine.x), np.diff(mine.y))
-        drives = (way > STILL[0]) & (seconds > 0.0)
-        speeds.append(way[drives] / seconds[drives])
+        speed = np.full(len(mine) - NEXT, np.inf)
+        for k in range(1, NEXT + 1):
+            seconds = (mine.stamp[k:] - mine.stamp[:-k]) / 1e9
+            way = np.hypot(mine.x[k:] - mine.x[:-k], mine.y[k:] - mine.y[:-k])
+            # readings of a robot that stands do not count
+            ahead = np.where(way > STILL[0], way, 0.0)[: len(speed)]
+            after = seconds[: len(speed)]
+            speed = np.minimum(speed, np.divide(ahead, after, out=np.full(len(speed), np.inf), where=after > 0.0))
+        speeds.append(speed[(speed > 0.0) & np.isfinite(speed)])
     driven = np.concatenate(speeds) if speeds else np.zeros(0)
     if len(driven) < ENOUGH or np.median(driven) < FASTEST:
         return ''

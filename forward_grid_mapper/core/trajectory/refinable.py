@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 
 from ..common.readings import Readings
@@ -23,7 +25,7 @@ ONE_WAY = 0.97
 def without_times(readings: Readings, odometry: Odometry) -> str:
     """Return why the odometry does not cover all readings; empty if it does."""
     if not len(odometry.stamp):
-        return 'there are no poses of odometry, as in a journal'
+        return "there are no poses of odometry, as in a journal or after a jump of odometry's clock"
     early, late = readings.stamp.min(initial=odometry.stamp[0]), readings.stamp.max(initial=odometry.stamp[-1])
     if early < odometry.stamp[0] or late > odometry.stamp[-1]:
         return "there are readings at times without odometry, as after a jump of odometry's clock"
@@ -35,10 +37,9 @@ def unfit(readings: Readings, odometry: Odometry) -> str:
     if reason := without_times(readings, odometry):
         return reason
     if len(odometry.stamp) < 2 or odometry.travel[-1] < SHORTEST:
-        return (
-            f'the drive is {odometry.travel[-1]:.1f} m long; the drift of odometry can be measured from {SHORTEST:g} '
-            'm on'
-        )
+        # rounded down, so that it does not look long enough
+        length = math.floor(10 * odometry.travel[-1]) / 10
+        return f'the drive is {length:.1f} m long; the drift of odometry can be measured from {SHORTEST:g} m on'
     if len(readings) < FEWEST_READINGS:
         return f'the drive has {counted(len(readings), "reading")}; at least {FEWEST_READINGS} are needed'
     if readings.echo.mean() < LEAST_ECHOES:

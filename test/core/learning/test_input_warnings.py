@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Callable
+from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
 from typing import NamedTuple
@@ -277,6 +278,17 @@ def test_simulated_worlds_give_no_warning(noise: object, sonars: Callable[[], So
         ):
             # ten poses a second
             assert warnings_of(Messages(dict(recording.extrinsics), recording.odometry[::5], recording.ranges)) == []
+
+
+@pytest.mark.parametrize('given', [circling, drive])
+@pytest.mark.parametrize('back', [21.0, 29.0])
+@pytest.mark.parametrize('apart', [0.0, 0.037])
+def test_two_places_at_one_time_give_no_warning(given: Callable[[], Messages], back: float, apart: float) -> None:
+    """The clock jumped back in the middle of the drive, and the robot drove on."""
+    readings = associated(*given()).readings
+    stamp, half = readings.stamp.copy(), len(readings) // 2
+    stamp[half:] -= round((back + apart) * SECOND)
+    assert input_warnings(replace(readings, stamp=stamp)) == []
 
 
 def test_few_readings_may_have_a_period_at_random() -> None:

@@ -29,7 +29,7 @@ from forward_grid_mapper.core.trajectory.holding_out import (
 from forward_grid_mapper.core.trajectory.hypotheses import Solved
 from forward_grid_mapper.core.trajectory.outcome import Refinement
 from forward_grid_mapper.core.trajectory.poses import compose, relative, rms_after_alignment
-from forward_grid_mapper.core.trajectory.refinable import unfit
+from forward_grid_mapper.core.trajectory.refinable import SHORTEST, unfit
 from forward_grid_mapper.core.trajectory.refinement import Refiner
 from forward_grid_mapper.core.trajectory.scans import Scans
 from forward_grid_mapper.core.trajectory.windows import Odometry, cut
@@ -292,10 +292,16 @@ def still(readings: Readings, odometry: Odometry) -> tuple[Readings, Odometry]:
     return readings, replace(odometry, pose=np.zeros_like(odometry.pose))
 
 
-def short(readings: Readings, odometry: Odometry) -> tuple[Readings, Odometry]:
-    last = int(np.searchsorted(odometry.travel, 2.0))
+def short(readings: Readings, odometry: Odometry, metres: float = 2.0) -> tuple[Readings, Odometry]:
+    last = int(np.searchsorted(odometry.travel, metres))
     kept = readings.stamp <= odometry.stamp[last]
     return readings.select(kept), Odometry(odometry.stamp[: last + 1], odometry.pose[: last + 1])
+
+
+def nearly_long_enough(readings: Readings, odometry: Odometry) -> tuple[Readings, Odometry]:
+    readings, odometry = short(readings, odometry, SHORTEST)
+    by = (SHORTEST - 0.01) / odometry.travel[-1]
+    return readings, Odometry(odometry.stamp, odometry.pose * [by, by, 1.0])
 
 
 def without_echoes(readings: Readings, odometry: Odometry) -> tuple[Readings, Odometry]:
@@ -320,10 +326,11 @@ def nothing(readings: Readings, odometry: Odometry) -> tuple[Readings, Odometry]
     [
         (short, '2.0 m long'),
         (still, '0.0 m long'),
+        (nearly_long_enough, 'the drive is 7.9 m long; the drift of odometry can be measured from 8 m'),
         (without_echoes, 'have an echo'),
         (one_sensor, 'one sensor'),
         (late, 'without odometry'),
-        (nothing, 'no poses of odometry'),
+        (nothing, "no poses of odometry, as in a journal or after a jump of odometry's clock"),
     ],
 )
 def test_unsuitable_drive_is_not_refined_with_reason(bent, spoiled, word) -> None:
