@@ -306,6 +306,11 @@ def one_sensor(readings: Readings, odometry: Odometry) -> tuple[Readings, Odomet
     return readings.select(np.repeat(np.flatnonzero(readings.sensor == 0), 2)), odometry
 
 
+def one_sensor_to_the_side(readings: Readings, odometry: Odometry) -> tuple[Readings, Odometry]:
+    kept, odometry = one_sensor(readings, odometry)
+    return replace(kept, yaw=kept.yaw + np.pi / 2), odometry
+
+
 def late(readings: Readings, odometry: Odometry) -> tuple[Readings, Odometry]:
     half = len(odometry.stamp) // 2
     return readings, Odometry(odometry.stamp[half:], odometry.pose[half:])
@@ -322,6 +327,7 @@ def nothing(readings: Readings, odometry: Odometry) -> tuple[Readings, Odometry]
         (still, '0.0 m long'),
         (without_echoes, 'have an echo'),
         (one_sensor, 'one sensor'),
+        (one_sensor_to_the_side, 'one sensor'),
         (late, 'without odometry'),
         (nothing, 'no poses of odometry'),
     ],
