@@ -269,6 +269,7 @@ class Journal:
             if self._drive.gone:
                 # rows for a file that will not return
                 self._backlog.drop(self._drive)
+            self._drive.head = self._names()
             self._drive = Drive(following(self._drive.path), continues=continues)
         self._numbers, self._stated = {}, ()
         self._next = self._next_points = OWN if continues else 0
@@ -279,13 +280,18 @@ class Journal:
         rows: list[Insert] = []
         stated = (*frames, self.parameters)
         if stated != self._stated:
-            self._stated = (*frames, dict(self.parameters))
-            rows.append(('drive', (0, *map(encoded, frames), json.dumps(self.parameters).encode())))
+            self._stated = stated
+            rows.append(_drive_row(*stated))
         for name in names:
             if name not in self._numbers:
                 self._numbers[name] = max(self._numbers.values(), default=-1) + 1
                 rows.append(('sensors', (self._numbers[name], encoded(name))))
         return rows
+
+    def _names(self) -> list[Insert]:
+        """Return all rows that must precede the readings of the drive."""
+        rows = [_drive_row(*self._stated)] if self._stated else []
+        return [*rows, *(('sensors', (number, encoded(name))) for name, number in self._numbers.items())]
 
     def _put_rows(self, rows: list[Insert], readings: int) -> None:
         if rows:
@@ -377,7 +383,7 @@ class Journal:
             if drive is self._drive:
                 drive.gone = True
             else:
-                # an earlier drive: its remaining rows go to a new file
+                # an earlier drive: its remaining rows go to a new file, which begins with `head`
                 drive.path, drive.made, drive.next = following(drive.path), False, 0
 
     def _smaller(self, items: list[Item]) -> bool:
@@ -415,6 +421,10 @@ class Journal:
     def _notice(self, text: str) -> None:
         self.notice, self.noticed = text, time.monotonic()
         self._warn(text)
+
+
+def _drive_row(map_frame: str, base_frame: str, parameters: dict[str, Any]) -> Insert:
+    return 'drive', (0, encoded(map_frame), encoded(base_frame), json.dumps(parameters).encode())
 
 
 def _words(error: Exception) -> str:

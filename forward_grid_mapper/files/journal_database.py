@@ -14,7 +14,7 @@ import sqlite3
 import threading
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import closing, suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 from ..core.common.errors import BagError, OutputError
@@ -57,6 +57,8 @@ class Drive:
         Number of the first reading after the committed ones.
     continues : str
         Name of the file with its earlier readings, as long as these were not copied; '' if there is none.
+    head : list of (table, values)
+        Rows without which its readings cannot be read, once the drive has ended; a file that is created has them.
     """
 
     path: Path
@@ -64,6 +66,7 @@ class Drive:
     gone: bool = False
     next: int = 0
     continues: str = ''
+    head: list[Insert] = field(default_factory=list)
 
 
 class GoneError(Exception):
@@ -344,6 +347,8 @@ class DriveWriter:
             if drive.continues:
                 values = (CONTINUES, None, None, drive.continues.encode())
                 database.execute(INSERT['drive'], values)
+            for table, values in drive.head:
+                database.execute(INSERT[table], values)
             database.execute(f'PRAGMA application_id={APPLICATION}')
             database.execute(f'PRAGMA user_version={VERSION}')
             database.execute('COMMIT')

@@ -11,7 +11,7 @@ from typing import Any
 from ..core.messages.extrinsics import LATE, LATER, Later, mount_of
 from ..core.messages.message_types import NANOSECONDS, OdometryMessage, Pose2, planar_pose, stamp_of
 from ..core.messages.quaternions import rotation_of
-from ..core.messages.stamp_order import GOES_ON, JUMP, JUMPED_BACK, StampOrder
+from ..core.messages.stamp_order import GOES_ON, JUMPED_BACK, StampOrder
 
 TF, TF_STATIC = '/tf', '/tf_static'
 
@@ -96,10 +96,8 @@ class Transforms:
             Relation of the stamp to earlier ones (`stamp_order.order_of`).
         """
         order = self._order.take(stamp)
-        if order == JUMPED_BACK:
-            self._missing.clear()
-            if self._buffer is not None:
-                self._buffer.clear()
+        if order == JUMPED_BACK and self._buffer is not None:
+            self._buffer.clear()
         return order
 
     def lookup(self, target: str, source: str, stamp: int) -> Any | Later:
@@ -119,7 +117,6 @@ class Transforms:
                 return LATE
             self._missing[key] = time.monotonic() + PATIENCE
             return LATER
-        self._missing.pop(key, None)
         return found.transform
 
     def latest(self, target: str, source: str) -> int | None:
@@ -238,7 +235,7 @@ class MapFrame:
         if not self._map_frame or message.frame_id.lstrip('/') == self._map_frame.lstrip('/'):
             return [message]
         # the associator sorts messages that only overtook others; a stamp far ahead would block all others
-        while order != GOES_ON and self._held and (order == JUMPED_BACK or self._held[-1].stamp > message.stamp + JUMP):
+        while order != GOES_ON and self._held and (order == JUMPED_BACK or self._held[-1].stamp > message.stamp):
             self.dropped += 1
             self._held.pop()
         self._held.append(message)

@@ -16,7 +16,7 @@ from forward_grid_mapper.bags.reader import Bag
 from forward_grid_mapper.bags.writer import BagWriter
 from forward_grid_mapper.core.common.errors import OutputError
 from forward_grid_mapper.core.common.grid import Grid
-from forward_grid_mapper.core.messages.message_types import RangeMessage
+from forward_grid_mapper.core.messages.message_types import OdometryMessage, Pose2, RangeMessage
 
 RANGE = RangeMessage(START, 'sonar_0', 1.0, 0.125, 5.0, 0.25)
 GRID = Grid(0.25, -3, 5, 4, 2)
@@ -148,3 +148,15 @@ def test_bag_with_spaces_and_accents_in_its_name_is_read(tmp_path: Path, kind: s
     path = write_sample(tmp_path, kind, count=2, name='Büro 1 – Süd')
     with Bag(path) as bag:
         assert len(list(bag.messages(bag.choose_topics()))) == 4
+
+
+@pytest.mark.parametrize('kind', KINDS)
+@pytest.mark.parametrize('yaw', [-3.0, -0.5, 0.0, 1.0, 2.5])
+def test_written_pose_has_its_yaw(tmp_path: Path, kind: str, yaw: float) -> None:
+    path, message = final_path(tmp_path, kind), OdometryMessage(START, 'odom', 'base_link', Pose2(1.0, -2.0, yaw))
+    with BagWriter(path, kind) as writer:
+        writer.write_odometry('/odom', message)
+        writer.write_range('/sonar', RANGE)
+    with Bag(path) as bag:
+        (read,) = (each for each in bag.messages(bag.choose_topics()) if isinstance(each, OdometryMessage))
+    assert read.pose == pytest.approx((1.0, -2.0, yaw))

@@ -94,3 +94,13 @@ def test_loops_of_frames_end() -> None:
         joints.add_message(message(SECOND, parent, child, (1.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0)))
     assert not joints.connects('base', 'a')
     assert joints.lookup('base', 'a', SECOND) is None
+
+
+def test_frames_are_connected_as_soon_as_their_transforms_come() -> None:
+    joints = MovingTransforms(StaticTransforms(), {'servo', 'sonar'})
+    none = (0.0, 0.0, 0.0, 1.0)
+    joints.add_message(message(SECOND, 'base', 'servo', (0.5, 0.0, 0.0), none))
+    assert joints.lookup('base', 'sonar', SECOND) is None and not joints.connects('base', 'sonar')
+    joints.add_message(message(SECOND, 'servo', 'sonar', (0.1, 0.0, 0.0), none))
+    assert joints.connects('base', 'sonar')
+    assert joints.lookup('base', 'sonar', SECOND)[:3] == pytest.approx((0.6, 0.0, 0.0))

@@ -136,6 +136,12 @@ def test_range_topics_of_a_robot_are_chosen_by_namespace() -> None:
     assert ranges_of('/odom', ['/odom', '/r2/odom'], ('/sonar', '/r2/sonar')) == Assigned(('/sonar',), ('/r2/sonar',))
 
 
+def test_namespace_that_begins_with_that_of_another_robot_is_not_inside_it() -> None:
+    odometry, ranges = ['/r1/odom', '/r10/odom'], ['/r1/sonar', '/r10/sonar', '/r100/sonar']
+    assert ranges_of('/r1/odom', odometry, ranges) == Assigned(('/r1/sonar',), ('/r10/sonar', '/r100/sonar'))
+    assert by_precedence(['/r1/tf_static', '/tf_static'], ['/r10/odom']) == ['/r1/tf_static', '/tf_static']
+
+
 def test_precedence_of_static_transforms() -> None:
     topics = ['/r1/tf_static', '/r2/tf_static', '/tf_static']
     assert by_precedence(topics, ['/r1/odom', '/r1/sonar']) == ['/tf_static', '/r1/tf_static']

@@ -159,3 +159,13 @@ def test_different_poses_on_one_topic_are_a_doubt() -> None:
     assert not transforms.doubts('base', 'left')
     (doubt,) = transforms.doubts('base', 'right')
     assert "different poses of 'right'" in doubt and 'the last one is used' in doubt
+
+
+def test_valid_transform_replaces_a_rejected_one() -> None:
+    """What is missing elsewhere is then not blamed on it."""
+    transforms = StaticTransforms()
+    transforms.add_if_valid('arm', 'sonar', NONE, (0.0, 0.0, 0.0, 0.5))
+    with pytest.raises(InputError, match='quaternion of length'):
+        transforms.lookup('base', 'sonar')
+    transforms.add_if_valid('arm', 'sonar', NONE, IDENTITY)
+    assert transforms.lookup('base', 'sonar') is None

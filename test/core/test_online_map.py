@@ -15,7 +15,7 @@ from failing import Allocations
 
 from forward_grid_mapper.core import online_map
 from forward_grid_mapper.core.common.errors import InputError
-from forward_grid_mapper.core.common.grid import Grid, part_of
+from forward_grid_mapper.core.common.grid import Grid, part_of, united
 from forward_grid_mapper.core.common.parameters import Parameters
 from forward_grid_mapper.core.common.readings import Readings
 from forward_grid_mapper.core.evidence import evidence as evidence_module
@@ -93,7 +93,7 @@ def test_growing_grid_keeps_the_state(monkeypatch: pytest.MonkeyPatch) -> None:
     online = in_sweeps(near, Parameters().varied({'p_rand': 0.3, 'p_lost': 0.4}))
     grid, before = online.maps()[:2]
     room = online._evidence.grid
-    traversed = online._traversed.copy()
+    traversed, since = online._traversed.copy(), online._since
     online.add(away)
     larger, ml = online.maps()[:2]
     assert online._evidence.grid.size > room.size
@@ -101,7 +101,10 @@ def test_growing_grid_keeps_the_state(monkeypatch: pytest.MonkeyPatch) -> None:
     assert np.array_equal(part_of(larger, ml, grid), before)
     assert (ml == 1).sum() > (before == 1).sum()
     assert len(online) == len(near) + len(away)
-    assert online._traversed[online._evidence.grid.window(room)][traversed].all()
+    rows, columns = online._evidence.grid.window(room)
+    assert online._traversed[rows, columns][traversed].all()
+    moved = since[0] + rows.start, since[1] + rows.start, since[2] + columns.start, since[3] + columns.start
+    assert online._since == united(moved, online._around(online._evidence, away)), 'what is to be refined'
     assert consistent(online)
     again = in_sweeps(near, Parameters())
     assert again._evidence.grid == room
@@ -259,10 +262,10 @@ def test_grid_of_a_corridor_has_margins_within_max_cells(turned: bool) -> None:
     room, needed = online._evidence.grid, online.grid
     assert needed.width <= room.width <= 1.5 * needed.width + 2 * MARGIN
     assert needed.height <= room.height <= 1.5 * needed.height + 2 * MARGIN
-    most = online.grid.size + 1000
-    bounded = in_sweeps(readings, Parameters().varied({'max_cells': most}))
-    assert bounded.grid == online.grid
-    assert bounded._evidence.grid.size <= most
+    for most in (online.grid.size + 1000, room.size - 1):
+        bounded = in_sweeps(readings, Parameters().varied({'max_cells': most}))
+        assert bounded.grid == online.grid
+        assert bounded._evidence.grid.size <= most
 
 
 def test_sweep_of_a_driver_that_knows_no_largest_range_examines_only_its_surroundings() -> None:
@@ -367,6 +370,8 @@ def test_map_is_searched_again_at_intervals(monkeypatch: pytest.MonkeyPatch) -> 
     monkeypatch.setattr(online_map, 'REFINE_EVERY', 50)
     often = in_sweeps(some(), Parameters())
     assert often._count == 150 - 2 * 72
+    # only what changed since is searched the next time
+    assert often._since == often._around(often._evidence, some().select(slice(144, 150)))
     assert consistent(often)
     for name in ('REFINE_EVERY', 'REFINE_LEAST'):
         monkeypatch.setattr(online_map, name, math.inf)
@@ -479,6 +484,22 @@ def test_call_without_memory_adds_no_readings_or_all(monkeypatch: pytest.MonkeyP
     assert done
     assert refused > 15
     assert searched_later or case == 'first'
+
+
+def test_readings_that_could_not_be_added_are_not_known(monkeypatch: pytest.MonkeyPatch) -> None:
+    readings, online = some(), OnlineMap(Parameters())
+    online.add(readings.select(slice(0, 50)))
+
+    def without_memory(*arguments: object) -> None:
+        raise MemoryError
+
+    with monkeypatch.context() as patched, pytest.raises(MemoryError):
+        patched.setattr(Evidence, 'extend', without_memory)
+        online.add(readings.select(slice(50, 100)))
+    assert (len(online._kept), online.taken) == (len(online), 50)
+    online.add(readings.select(slice(50, 100)))
+    assert (len(online._kept), online.taken) == (len(online), 100)
+    assert consistent(online)
 
 
 def test_cells_count_merged_readings_with_their_multiplicity(monkeypatch: pytest.MonkeyPatch) -> None:

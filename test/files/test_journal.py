@@ -26,7 +26,7 @@ from patience import PATIENCE, line_of
 
 from forward_grid_mapper.core.common.errors import BagError, OutputError
 from forward_grid_mapper.files import journal as journal_module
-from forward_grid_mapper.files import syncing
+from forward_grid_mapper.files import journal_database, journal_reader, syncing
 from forward_grid_mapper.files.journal import Journal, drive_file, drives
 from forward_grid_mapper.files.journal_database import DriveWriter
 from forward_grid_mapper.files.journal_format import ROW, Contents
@@ -139,7 +139,9 @@ def test_put_does_not_wait_for_commits(tmp_path: Path) -> None:
 # a file that was deleted or replaced
 
 
-@pytest.mark.parametrize('what', ['file', 'log', 'both', 'folder', 'moved', 'replaced', 'file cut', 'log cut'])
+@pytest.mark.parametrize(
+    'what', ['file', 'log', 'both', 'folder', 'moved', 'replaced', 'file cut', 'log cut', 'a byte cut']
+)
 def test_deleted_journal_is_detected_and_replaced(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, what: str) -> None:
     monkeypatch.setattr(journal_module, 'CHECK_PERIOD', 0.01)
     folder, warnings = tmp_path / 'j', []
@@ -162,6 +164,8 @@ def test_deleted_journal_is_detected_and_replaced(tmp_path: Path, monkeypatch: p
         os.truncate(path, 5000)
     if what == 'log cut':
         os.truncate(log_of(path), 5000)
+    if what == 'a byte cut':
+        os.truncate(log_of(path), log_of(path).stat().st_size - 1)
     # also if no readings are put
     until(lambda: journal.gone)
     assert 'the readings in memory are written to a new file' in warnings[0]
@@ -183,6 +187,29 @@ def test_deleted_journal_is_detected_and_replaced(tmp_path: Path, monkeypatch: p
         Journal(folder, print)
     journal.close()
     assert len(warnings) == 1
+
+
+def test_waiting_readings_of_an_earlier_drive_whose_file_was_deleted_get_a_new_file(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As if a user resets a node whose disk is full, and deletes the file of the drive to make room."""
+    monkeypatch.setattr(journal_module, 'RETRY', 0.01)
+    journal, _ = opened(tmp_path)
+    journal.parameters = {'resolution': 0.05}
+    written(journal, made(0, 10))
+    with no_room(journal):
+        journal.put(made(10, 2000), FRAMES)
+        until(lambda: journal.trouble)
+        journal.begin_drive()
+        journal.put(made(3000, 10), FRAMES)
+        (tmp_path / 'drive_0001.journal').unlink()
+        until(lambda: not journal.unwritten)
+    journal.close()
+    assert [path.name for path in drives(tmp_path)] == ['drive_0002.journal', 'drive_0003.journal']
+    found, contents = numbers(drives(tmp_path)[0])
+    assert found == list(range(10, 2010)) and contents.harm == ''
+    assert (contents.map_frame, contents.base_frame) == FRAMES and contents.parameters == {'resolution': 0.05}
+    assert numbers(drives(tmp_path)[1])[0] == list(range(3000, 3010))
 
 
 def test_log_of_another_file_is_not_deleted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -215,12 +242,14 @@ def no_room(journal: Journal) -> Iterator[None]:
     pages = database.execute('PRAGMA page_count').fetchone()[0]
     database.execute(f'PRAGMA max_page_count={pages}')
     yield
-    database.execute('PRAGMA max_page_count=1073741823')
+    # closed if its file was deleted meanwhile
+    with contextlib.suppress(sqlite3.ProgrammingError):
+        database.execute('PRAGMA max_page_count=1073741823')
 
 
 def test_full_disk_gives_one_warning_and_readings_wait(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(journal_module, 'RETRY', 0.01)
-    monkeypatch.setattr(journal_module, 'STEADY', 0.1)
+    monkeypatch.setattr(journal_module, 'STEADY', 1e9)
     monkeypatch.setattr(journal_module, 'CHECK_PERIOD', 0.01)
     warnings: list[str] = []
     journal, _ = opened(tmp_path, warnings)
@@ -234,7 +263,11 @@ def test_full_disk_gives_one_warning_and_readings_wait(tmp_path: Path, monkeypat
         assert os.strerror(errno.ENOSPC) in warnings[0]
         assert journal.unwritten >= 400
     until(lambda: not journal.unwritten)
+    checked, check = list[None](), journal._writer.check_file
+    monkeypatch.setattr(journal._writer, 'check_file', lambda: (checked.append(None), check()))
+    until(lambda: len(checked) > 2)
     assert journal.trouble, 'the next attempt may fail'
+    monkeypatch.setattr(journal_module, 'STEADY', 0.0)
     until(lambda: not journal.trouble)
     assert len(warnings) == 2 and 'writing works again' in warnings[1]
     journal.close()
@@ -329,8 +362,9 @@ def test_without_a_free_descriptor_readings_are_written_once(tmp_path: Path, mon
 
 
 def test_block_written_again_is_stored_once(tmp_path: Path) -> None:
-    """As after a commit that reached the disk but reported a failure."""
-    journal, _ = opened(tmp_path)
+    """As after a commit that reached the disk but reported a failure; the file is then opened again."""
+    warnings: list[str] = []
+    journal, _ = opened(tmp_path, warnings)
     written(journal, made(0, 10))
     writer = journal._writer
     write = writer.write
@@ -338,6 +372,7 @@ def test_block_written_again_is_stored_once(tmp_path: Path) -> None:
     def fails(*arguments: object) -> Path:
         write(*arguments)  # type: ignore[arg-type]
         writer.write = write  # type: ignore[method-assign]
+        writer.close()
         raise OSError(errno.EIO, 'Input/output error')
 
     writer.write = fails  # type: ignore[method-assign,assignment]
@@ -348,6 +383,8 @@ def test_block_written_again_is_stored_once(tmp_path: Path) -> None:
     found, contents = numbers(journal.path)
     assert found == list(range(30))
     assert len(contents.path) == 3
+    # the file has all that was written to it, so there is no new one
+    assert len(warnings) == 1 and names_in(tmp_path) == ['drive_0001.journal', 'lock']
 
 
 def test_slow_sync_does_not_delay_writing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -499,6 +536,52 @@ def test_incomplete_new_journal_is_replaced(tmp_path: Path) -> None:
     journal.close()
     assert names_in(tmp_path) == ['drive_0001.journal', 'lock']
     assert numbers(journal.path)[0] == list(range(10))
+
+
+def test_new_file_is_not_used_before_it_is_complete(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """As if SQLite could not move its log into the file, so that the file alone lacks its tables."""
+    monkeypatch.setattr(journal_module, 'RETRY', 0.01)
+    left = [tmp_path / '.new.journal-wal', tmp_path / '.new.journal-journal']
+
+    @contextlib.contextmanager
+    def closing(database: sqlite3.Connection) -> Iterator[sqlite3.Connection]:
+        with contextlib.closing(database):
+            yield database
+        if left:
+            left.pop().write_bytes(b'')
+
+    monkeypatch.setattr(journal_database, 'closing', closing)
+    warnings: list[str] = []
+    journal, _ = opened(tmp_path, warnings)
+    until(lambda: not left)
+    written(journal, made(0, 10))
+    journal.close()
+    assert 'a new file could not be completed' in warnings[0]
+    assert names_in(tmp_path) == ['drive_0001.journal', 'lock']
+    assert numbers(journal.path)[0] == list(range(10))
+
+
+def test_file_that_cannot_be_read_again_at_the_start_is_replaced(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    journal, _ = opened(tmp_path)
+    written(journal, made(0, 10))
+    journal.close()
+    read_rows, tables = journal_reader._Table.rows, list[str]()
+
+    def failing(table: journal_reader._Table, name: str, *columns: str) -> Iterator[tuple[object, ...]]:
+        tables.append(name)
+        if tables.count('readings') == 2:
+            raise sqlite3.OperationalError('disk I/O error')
+        yield from read_rows(table, name, *columns)
+
+    with monkeypatch.context() as patched:
+        patched.setattr(journal_reader._Table, 'rows', failing)
+        journal, chunks = opened(tmp_path)
+    assert chunks == [] and journal.gone, 'new readings must not follow those that are not in memory'
+    journal.renew(made(10, 10), FRAMES, [])
+    journal.close()
+    assert [numbers(path)[0] for path in drives(tmp_path)] == [list(range(10)), list(range(10, 20))]
 
 
 @pytest.mark.parametrize('content', ['bytes', 'directory', 'nan', 'cut', 'newer', 'rollback', 'empty'])

@@ -172,6 +172,44 @@ def test_full_disk_keeps_new_readings_and_the_next_start_copies(
     assert newest(tmp_path / 'j')[0] == back and whole(tmp_path / 'j')
 
 
+def test_path_of_a_file_that_was_not_copied_comes_before_the_own_one(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    old = previous_journal(tmp_path / 'j')
+    usage = shutil.disk_usage(tmp_path)
+    with monkeypatch.context() as patched:
+        patched.setattr(journal_backlog.shutil, 'disk_usage', lambda path: usage._replace(free=1000))
+        # the first run receives nothing
+        restored(tmp_path / 'j')[0].close()
+        journal, _ = restored(tmp_path / 'j')
+        written(journal, made(len(old), 10))
+        journal.close()
+    journal, _ = restored(tmp_path / 'j')
+    until(lambda: not journal.unwritten)
+    journal.close()
+    found, contents = newest(tmp_path / 'j')
+    assert found == list(range(len(old) + 10)) and contents.continues == ''
+    assert contents.path == [*((10.0 * k, 0.0) for k in range(50)), (float(len(old)), 0.0)]
+
+
+def test_file_that_changed_since_it_was_read_is_not_copied(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The node has other readings in memory than the file has."""
+    previous_journal(tmp_path / 'j')
+    begin, warnings = Copied.__iter__, list[str]()
+
+    def changed(copied: Copied) -> Iterator[Insert]:
+        (tmp_path / 'j' / 'drive_0001.journal').write_bytes(Previous.file(400))
+        yield from begin(copied)
+
+    with monkeypatch.context() as patched:
+        patched.setattr(Copied, '__iter__', changed)
+        journal, back = restored(tmp_path / 'j', warnings)
+        written(journal, made(500, 10))
+        journal.close()
+    assert back == list(range(500)) and 'drive_0001.journal has changed; the next start tries it' in warnings[-1]
+    assert newest(tmp_path / 'j')[1].continues == 'drive_0001.journal'
+
+
 @pytest.mark.parametrize('why', ['no room for a copy', 'another version', 'an error of the disk'])
 def test_file_that_cannot_be_read_at_one_start_is_read_at_a_later_one(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, why: str

@@ -22,7 +22,7 @@ from patience import PATIENCE, line_of
 from forward_grid_mapper.core.common.errors import BagError
 from forward_grid_mapper.files.journal import drive_file
 from forward_grid_mapper.files.journal_format import ROW, Contents
-from forward_grid_mapper.files.journal_reader import log_of
+from forward_grid_mapper.files.journal_reader import log_of, read
 
 FORGE = 'import sqlite3, sys; d = sqlite3.connect(sys.argv[1]); d.execute(sys.argv[2]); d.commit(); d.close()'
 
@@ -492,3 +492,13 @@ def test_journal_truncated_while_it_is_read_is_reported(tmp_path: Path, format: 
     else:
         assert 0 < result['count'] < 200_000
         assert result['error'] or result['harm']
+
+
+def test_journal_changed_while_it_is_read_is_reported(path: Path) -> None:
+    """Also if its size stays the same, as when another program writes into it."""
+    database(path, [rows(made(1000 * k, 1000)).tobytes() for k in range(100)]).close()
+    found = read(path, Contents())
+    next(found)
+    os.utime(path, ns=(0, 0))
+    with pytest.raises(BagError, match='was written while it was read; read it again'):
+        list(found)

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import dataclasses
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 
 from forward_grid_mapper.core.common.parameters import Parameters
 from forward_grid_mapper.core.mapping import Mapper
-from forward_grid_mapper.files.quality_warning import data_warnings, quality_warning
+from forward_grid_mapper.files.quality_warning import data_warnings, jumps_warning, quality_warning
 from forward_grid_mapper.files.results import write_results
 from forward_grid_mapper.simulation.drive import door_drive
 
@@ -38,3 +39,16 @@ def test_warning_if_no_reading_has_an_echo() -> None:
     one[0] /= 2
     with_echo = Mapper(Parameters()).run(dataclasses.replace(drive, z=one))
     assert not any('has an echo' in text for text in data_warnings(with_echo, {}))
+
+
+def test_half_of_the_readings_may_be_random() -> None:
+    for random, warns in ((10, False), (11, True)):
+        maps = SimpleNamespace(readings=range(20), unexplained=np.arange(20) < random)
+        assert bool(quality_warning(maps)) == warns
+
+
+def test_driving_before_a_jump_does_not_include_it() -> None:
+    steps = np.array([1.0, 2.0, 50.0, 4.0, 60.0])
+    assert jumps_warning(steps, [2, 4], '').startswith('odometry jumps 2 times, first by 50.0 m after 3 m of driving')
+    assert jumps_warning(steps, [0], '').startswith('odometry jumps once, by 1.0 m after 0 m of driving')
+    assert jumps_warning(steps, [], '') == ''

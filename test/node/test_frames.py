@@ -13,6 +13,7 @@ pytest.importorskip('rclpy', reason='stamps are asked for with rclpy')
 from forward_grid_mapper.core.messages.extrinsics import LATE, LATER, STEEP
 from forward_grid_mapper.core.messages.message_types import NANOSECONDS, OdometryMessage, Pose2, RangeMessage
 from forward_grid_mapper.core.messages.pose_association import PoseAssociator
+from forward_grid_mapper.core.messages.stamp_order import JUMP
 from forward_grid_mapper.node import frames
 from forward_grid_mapper.node.frames import Extrinsics, MapFrame, Transforms
 
@@ -354,7 +355,7 @@ def test_odometry_waits_as_long_as_the_timeout_parameter(transforms: Transforms,
 
 @pytest.mark.parametrize('begin', [0, 1_700_000_000 * NANOSECONDS])
 def test_only_a_jump_back_of_time_drops_waiting_odometry(transforms: Transforms, begin: int) -> None:
-    for back, dropped in ((frames.JUMP, 0), (frames.JUMP + 1, 2)):
+    for back, dropped in ((JUMP, 0), (JUMP + 1, 2)):
         frame = MapFrame('map', transforms, 1000.0)
         for stamp in (begin + 8 * NANOSECONDS, begin + 9 * NANOSECONDS, begin + 9 * NANOSECONDS - back):
             assert frame.convert(OdometryMessage(stamp, 'odom', 'base', Pose2(0, 0, 0))) == []

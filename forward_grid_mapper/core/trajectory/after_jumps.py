@@ -180,14 +180,9 @@ def begins_of(parts: Sequence[Part], parameters: Parameters, stop: NDArray[np.ui
         path = moved_to(begin.pose if known else stood, part.path.pose)
         end, stamp = path[-1], int(part.odometry.stamp[-1])
         if known:
-            frame = compose(end, inverse(part.odometry.pose[-1]))
-            frames = [*(each for each in frames if not _same(each, frame)), frame]
+            frames.append(compose(end, inverse(part.odometry.pose[-1])))
             on_map.append(readings_moved(part.readings, part.path.pose[0], begin.pose))
     return out
-
-
-def _same(one: Floats, other: Floats) -> bool:
-    return bool(np.all(np.abs(relative(one, other)) < SIGMA))
 
 
 def _too_fast(before: Floats, after: Floats, seconds: float) -> bool:

@@ -144,6 +144,10 @@ SCENARIOS: dict[str, tuple[Callable[[Messages], Messages], str]] = {
         lambda m: m.mounted(turned(12)),
         r'sensors are rotated by 1[0-4] degrees \(±\d\.\d\) to the right of their stated poses; check the poses',
     ),
+    'sensors turned by 12 degrees the other way': (
+        lambda m: m.mounted(turned(-12)),
+        r'sensors are rotated by 1[0-4] degrees \(±\d\.\d\) to the left of their stated poses; check the poses',
+    ),
     'sensors stated too far forward': (
         lambda m: m.mounted(lambda p: Pose2(p.x + 0.2, p.y, p.yaw)),
         r'the sensors are 0\.(1[6-9]|2[0-4]) m \(±0\.0\d m\) behind their stated poses',

@@ -15,7 +15,7 @@ import pytest
 
 from forward_grid_mapper.core.common.parameters import Parameters
 from forward_grid_mapper.core.common.readings import Readings
-from forward_grid_mapper.core.learning.input_warnings import input_warnings
+from forward_grid_mapper.core.learning.input_warnings import LONGEST_PERIOD, input_warnings
 from forward_grid_mapper.core.messages.message_types import OdometryMessage, Pose2, RangeMessage
 from forward_grid_mapper.simulation.drive import building_drive, corridor_drive, door_drive
 from forward_grid_mapper.simulation.sonar import NOISE_FREE, NOISY, SonarArray, front_array, sonar_ring
@@ -308,6 +308,16 @@ def test_few_readings_may_have_a_period_at_random() -> None:
 
     assert not alternating(100)
     assert alternating(101)
+
+
+@pytest.mark.parametrize(('sensors', 'warns'), [(6, True), (LONGEST_PERIOD, True), (LONGEST_PERIOD + 1, False)])
+def test_rings_of_up_to_32_sensors_with_one_frame_are_detected(sensors: int, warns: bool) -> None:
+    k, wide = np.arange(20 * sensors), np.random.default_rng(2).permutation(sensors)
+    z = 1.0 + 8.0 * wide[k % sensors] / sensors
+    ranges = Readings.from_columns(
+        ('sonar',), x=0.01 * k, y=0.0, yaw=0.0, z=z, z_max=10.0, half_angle=0.13, stamp=k * 10**8 + 7 * 10**6
+    )
+    assert any('alternate like' in text for text in input_warnings(ranges)) == warns
 
 
 @pytest.mark.parametrize('odometry', ['/odom', '/odom_corrected'])

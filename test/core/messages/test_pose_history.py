@@ -177,3 +177,11 @@ def test_a_stamp_far_before_the_others_does_not_look_at_all_poses(monkeypatch: p
         expected = made.at(stamp, 2.0)
         assert reason == expected if isinstance(expected, str) else Pose2(*pose) == expected
     assert not len(made.at_all(np.zeros(0, np.int64), 2.0).reason)
+
+
+def test_second_pose_that_jumped_places_no_reading_of_a_batch() -> None:
+    """There is no pose two before it."""
+    made = history((1.0, Pose2(0, 0, 0)), (1.1, Pose2(600, 400, 0)))
+    stamps = np.array([SECOND, round(1.1 * SECOND)])
+    assert made.at_all(stamps, 1.0).reason.tolist() == ['', 'pose_jump']
+    assert made.at(int(stamps[1]), 1.0) == 'pose_jump'

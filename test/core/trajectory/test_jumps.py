@@ -122,6 +122,106 @@ def test_restart_after_a_full_turn_is_at_zero() -> None:
     assert jumps(odometry).tolist() == [count] and not len(doubtful_steps(odometry))
 
 
+def straight(count: int, seconds: float, speed: float) -> Odometry:
+    """A robot that drives along x."""
+    pose = np.zeros((count, 3))
+    pose[:, 0] = speed * seconds * np.arange(count)
+    return Odometry.of((np.arange(count) * seconds * 1e9).astype(np.int64), pose)
+
+
+def across_a_gap(odometry: Odometry, at: int, seconds: float, metres: float) -> Odometry:
+    """The drive whose messages before pose `at` are missing."""
+    later = np.arange(len(odometry.stamp)) >= at
+    pose = odometry.pose.copy()
+    pose[later, 0] += metres
+    return Odometry.of(odometry.stamp + np.where(later, int(seconds * 1e9), 0), pose)
+
+
+@pytest.mark.parametrize(('speed', 'jumps_there'), [(2.5, False), (3.5, True)])
+def test_no_robot_is_faster_than_three_metres_a_second_while_messages_are_missing(
+    speed: float, jumps_there: bool
+) -> None:
+    """Also if it is fast, so that it is slower than twice its usual speed."""
+    odometry = across_a_gap(straight(100, 0.1, 2.0), 50, 10.0, 10.0 * speed)
+    assert jumps(odometry).tolist() == [50] * jumps_there
+    assert not len(doubtful_steps(odometry))
+
+
+@pytest.mark.parametrize(('at', 'doubtful'), [(1, True), (2, False), (50, False), (98, False), (99, True)])
+def test_robot_of_rare_messages_moves_on_if_it_moved_before_and_after_a_gap(at: int, doubtful: bool) -> None:
+    """Its poses are farther apart than the moment before the gap, and after it."""
+    odometry = across_a_gap(straight(100, 1.5, 0.25), at, 10.0, 2.5)
+    assert doubtful_steps(odometry).tolist() == [at] * doubtful
+    assert not len(jumps(odometry))
+
+
+def test_pose_between_two_outliers_at_one_place_stays() -> None:
+    odometry = straight(100, 0.05, 0.5)
+    pose = odometry.pose.copy()
+    pose[[50, 52]] = 30.0, 20.0, 1.0
+    found = without_outliers(Odometry.of(odometry.stamp, pose))
+    assert np.array_equal(found.stamp, np.delete(odometry.stamp, [50, 52]))
+    assert np.array_equal(found.pose, np.delete(odometry.pose, [50, 52], axis=0))
+
+
+def test_outlier_of_half_a_turn_is_left_out_while_the_robot_turns() -> None:
+    """The turns to it and back have the same sign, so that the unwrapped yaw goes on by a full turn."""
+    odometry = straight(100, 0.05, 0.5)
+    odometry.pose[:, 2] = -0.01 * np.arange(100)
+    pose = odometry.pose.copy()
+    pose[50] += np.array([30.0, 20.0, np.pi - 0.005])
+    assert np.diff(Odometry.of(odometry.stamp, pose).pose[[49, 51], 2]) > 6.0
+    found = without_outliers(Odometry.of(odometry.stamp, pose))
+    assert np.array_equal(found.stamp, np.delete(odometry.stamp, 50))
+    assert found.pose == pytest.approx(np.delete(odometry.pose, 50, axis=0))
+
+
+def part_of_drive(begin: float, seconds: tuple[float, float]) -> after_jumps.Part:
+    """A robot that drives 2 m along x, with one reading at each pose."""
+    path = straight(100, (seconds[1] - seconds[0]) / 99, 2.0 / (seconds[1] - seconds[0]))
+    path.pose[:, 0] += begin
+    path = Odometry.of(path.stamp + int(seconds[0] * 1e9), path.pose)
+    x, y, yaw = path.pose.T
+    readings = Readings.from_columns(x=x, y=y, yaw=yaw, z=np.ones(100), z_max=2.0, half_angle=0.2, stamp=path.stamp)
+    return after_jumps.Part(readings, path, path, False)
+
+
+@pytest.mark.parametrize(
+    ('begin', 'seconds', 'guess'),
+    [
+        # messages are missing: it drove on in the frame of the restarted odometry, though that before is as near
+        (6.0, 5.0, 16.0),
+        # odometry returned to the frame before, since it cannot have been so fast otherwise
+        (12.5, 0.1, 12.5),
+        # neither is possible
+        (70.0, 0.1, 80.0),
+    ],
+)
+def test_pose_by_odometry_is_that_of_the_latest_frame_that_is_possible(
+    monkeypatch: pytest.MonkeyPatch, begin: float, seconds: float, guess: float
+) -> None:
+    guesses: list[tuple[float, float, bool]] = []
+
+    def begin_after(part: object, where: tuple[np.ndarray, np.ndarray], fast: bool, *rest: object) -> after_jumps.Begin:
+        guesses.append((where[0][0], where[1][0], fast))
+        return after_jumps.Begin(where[0], after_jumps.STOOD)
+
+    monkeypatch.setattr(after_jumps, '_begin_after', begin_after)
+    parts = [part_of_drive(8.0, (0, 10)), part_of_drive(0.0, (11, 20)), part_of_drive(begin, (20 + seconds, 40))]
+    found = after_jumps.begins_of(parts, Parameters(), np.zeros(1, np.uint8))
+    assert [each.how for each in found] == ['first', 'stood', 'stood']
+    assert found[1].pose[0] == pytest.approx(10.0)
+    assert guesses[1] == pytest.approx((12.0, guess, begin > 50.0))
+
+
+@pytest.mark.parametrize(('count', 'more'), [(2, ''), (3, ''), (4, '; and 1 more'), (6, '; and 3 more')])
+def test_three_jumps_are_listed_and_the_others_counted(count: int, more: str) -> None:
+    parts = [part_of_drive(9.0 * k, (10 * k, 10 * k + 9)) for k in range(count + 1)]
+    words = after_jumps.jump_words([after_jumps.Begin(np.zeros(3), after_jumps.STOOD)] * (count + 1), parts)
+    assert words.count('odometry jumps by 7.0 m after') == min(count, 3)
+    assert words.endswith(f'continues from that pose{more}')
+
+
 @pytest.mark.slow
 def test_drive_with_few_poses_is_refined(exact: Recording, bent: tuple[Readings, Odometry]) -> None:
     readings, odometry = with_few_poses(*bent, 1.1)

@@ -312,6 +312,11 @@ def one_sensor(readings: Readings, odometry: Odometry) -> tuple[Readings, Odomet
     return readings.select(np.repeat(np.flatnonzero(readings.sensor == 0), 2)), odometry
 
 
+def one_sensor_to_the_side(readings: Readings, odometry: Odometry) -> tuple[Readings, Odometry]:
+    kept, odometry = one_sensor(readings, odometry)
+    return replace(kept, yaw=kept.yaw + np.pi / 2), odometry
+
+
 def late(readings: Readings, odometry: Odometry) -> tuple[Readings, Odometry]:
     half = len(odometry.stamp) // 2
     return readings, Odometry(odometry.stamp[half:], odometry.pose[half:])
@@ -329,6 +334,7 @@ def nothing(readings: Readings, odometry: Odometry) -> tuple[Readings, Odometry]
         (nearly_long_enough, 'the drive is 7.9 m long; the drift of odometry can be measured from 8 m'),
         (without_echoes, 'have an echo'),
         (one_sensor, 'one sensor'),
+        (one_sensor_to_the_side, 'one sensor'),
         (late, 'without odometry'),
         (nothing, "no poses of odometry, as in a journal or after a jump of odometry's clock"),
     ],

@@ -41,6 +41,9 @@ def test_only_the_ends_of_long_stands_are_kept() -> None:
         assert len(found.stamp) == 201 and found.travel[-1] < driven.travel[-1] + 0.02
         assert found.stamp[[0, -1]].tolist() == long.stamp[[0, -1]].tolist()
         assert without_stands(found) is found
+        # also at the end of the drive
+        found = without_stands(with_stand(driven, 199, 70, noise))
+        assert len(found.stamp) == 201
     # 0.5 mm/s is no stand
     slow = Odometry(np.arange(7000) * 10**8, np.stack([5e-5 * np.arange(7000), *np.zeros((2, 7000))], axis=1))
     assert without_stands(slow) is slow
