@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -33,6 +33,7 @@ def write_results(
     extras: Mapping[str, str] | None = None,
     odometry_xy: NDArray[np.float64] = NOWHERE,
     judged: Sequence[str] | None = None,
+    agree: Callable[[], object] = lambda: None,
 ) -> dict[str, Any]:
     """Write maps, archive, picture, page and report into a new folder; if any of them fails, no folder remains.
 
@@ -55,6 +56,8 @@ def write_results(
         Path of odometry, metres, if it differs.
     judged : sequence of str, optional
         Result of `data_warnings` for the maps, if known.
+    agree : callable, optional
+        Called when all files are written; if it raises, no folder remains.
 
     Returns
     -------
@@ -92,4 +95,5 @@ def write_results(
         for name, text in (extras or {}).items():
             with output_errors(folder / name):
                 (folder / name).write_text(text, encoding='utf-8')
+        agree()
     return report

@@ -179,7 +179,7 @@ class MapperNode(ManagedNode):
         """Make what receives readings and keeps them, and the reporter, which watches all parts."""
         following = self.trajectory.following
         self._readings_worker = Worker('readings', self.get_logger().error)
-        self._ends += [partial(worker.close, 0.5) for worker in (self.saver.worker, self._readings_worker)]
+        self._ends += [partial(part.close, 0.5) for part in (self.saver, self._readings_worker)]
         self.journal = JournalKeeper(self, self.parameters.node.journal, self.associator)
         self.workers = [self._readings_worker, self.live.worker, self.maps.worker, self.em.worker.worker]
         self.workers += [part.worker for part in (self.saver, self.online, following, self.kernels) if part]

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import re
+import threading
 import time
 from collections.abc import Callable
-from contextlib import suppress
+from contextlib import ExitStack, suppress
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -80,6 +81,15 @@ class Saver:
         """Prepare; `account` is called by the executor."""
         self.worker = Worker('save_maps', logger.error)
         self._em, self._live, self._account, self._logger = em, live, account, logger
+        # locked while a folder gets its name, so that it has one exactly if the response says so
+        self._agreeing = threading.Lock()
+        self._ended = False
+
+    def close(self, seconds: float) -> None:
+        """Wait at most so many seconds for maps that are being written; no folder of them remains after that."""
+        self.worker.close(seconds)
+        with self._agreeing:
+            self._ended = True
 
     def save_maps(self, reply: Reply) -> None:
         """Answer the service; run EM first if it has not run."""
@@ -101,13 +111,15 @@ class Saver:
                 if live.generation != generation:
                     raise MapperError('there is no map to save: reset deleted them')
                 both = maps.with_live(live.grid, live.probability)
-                reply.send(True, self._write(both, account, explained, found))
+                with ExitStack() as named:
+                    reply.send(True, self._write(both, account, explained, found, named))
             except MapperError as error:
                 reply.send(False, str(error))
 
         self.worker.put(work, lambda why: reply.send(False, f'save_maps failed: {why}'))
 
-    def _write(self, maps: MapSet, account: Account, explained: int, found: Found | None) -> str:
+    def _write(self, maps: MapSet, account: Account, explained: int, found: Found | None, named: ExitStack) -> str:
+        """Write a folder, and return the response; from when it gets its name, `named` keeps `close` waiting."""
         newer = account.accepted - explained
         warnings = account.source['warnings']
         if newer > 0:
@@ -130,8 +142,15 @@ class Saver:
             options = {'extras': texts, 'odometry_xy': path_xy}
             path_xy = found.correction.path_of(*account.odometry)
 
+        def agree() -> None:
+            # another name of the folder is tried if this one was taken
+            named.close()
+            named.enter_context(self._agreeing)
+            if self._ended:
+                raise MapperError('the node is being cleaned up')
+
         def write(folder: Path) -> dict[str, Any]:
-            return write_results(folder, maps, account.source, path_xy, account.title, **options)
+            return write_results(folder, maps, account.source, path_xy, account.title, agree=agree, **options)
 
         folder, report = in_a_free_folder(parent, write)
         for warning in report['warnings']:

@@ -7,7 +7,9 @@ from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
+import pytest
 
+from forward_grid_mapper.core.common.errors import OutputError
 from forward_grid_mapper.core.common.parameters import Parameters
 from forward_grid_mapper.core.mapping import Mapper
 from forward_grid_mapper.files.quality_warning import data_warnings, jumps_warning, quality_warning
@@ -27,6 +29,13 @@ def test_warning_if_no_map_explains_the_readings(tmp_path: Path) -> None:
     assert 'are the poses of the sensors' in warning
     report = write_results(tmp_path / 'maps', wild, {}, np.zeros((0, 2)), 'wild')
     assert warning in report['warnings']
+
+    def refuse() -> None:
+        raise OutputError('too late')
+
+    with pytest.raises(OutputError, match='too late'):
+        write_results(tmp_path / 'refused', wild, {}, np.zeros((0, 2)), 'wild', agree=refuse)
+    assert [path.name for path in tmp_path.iterdir()] == ['maps'], 'whoever waited for the maps has gone'
 
 
 def test_warning_if_no_reading_has_an_echo() -> None:

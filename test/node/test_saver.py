@@ -72,6 +72,7 @@ class Node:
             readings=range(10),
             with_live=lambda grid, probability: SimpleNamespace(readings=range(10), live=(grid, probability)),
         )
+        self.before_agreeing = self.after_agreeing = lambda: None
         self.saver = Saver(self.em, self.live, self.account, self.log)
         monkeypatch.setattr(saver, 'write_results', self.write)
 
@@ -79,7 +80,10 @@ class Node:
         source = {**self.source, 'warnings': [*self.source['warnings']]}
         return Account(source, self.accepted, [(0.0, 1.0), (2.0, 3.0)], ODOMETRY, str(self.folder), 'Maps of me')
 
-    def write(self, folder: Path, *arguments: Any, **options: Any) -> dict[str, Any]:
+    def write(self, folder: Path, *arguments: Any, agree: Callable[[], None], **options: Any) -> dict[str, Any]:
+        self.before_agreeing()
+        agree()
+        self.after_agreeing()
         folder.mkdir(parents=True)
         for name in ('maps.npz', 'report.txt', 'b.pgm', 'report.html', 'ml_map.yaml'):
             (folder / name).touch()
@@ -251,6 +255,40 @@ def test_error_of_writing_is_the_response(
     until(lambda: not node.saver.worker.waiting)
     assert node.saver.worker.trouble == trouble
     assert node.save().answer()[0]
+
+
+def test_save_that_a_clean_up_cuts_leaves_no_folder(node: Node) -> None:
+    """The node answers the call with a failure."""
+    closed = threading.Event()
+    node.before_agreeing = lambda: closed.wait(60.0)
+    reply = node.save()
+    until(lambda: node.saver.worker._busy)
+    node.saver.close(0.0)
+    closed.set()
+    assert reply.answer() == (False, 'the node is being cleaned up')
+    assert not node.written and not node.folder.exists()
+
+
+def test_clean_up_waits_while_a_folder_gets_its_name(node: Node) -> None:
+    named, go, closed = threading.Event(), threading.Event(), list[int]()
+
+    def hold() -> None:
+        named.set()
+        assert go.wait(60.0)
+
+    def close() -> None:
+        node.saver.close(0.0)
+        closed.append(len(reply.sent))
+
+    node.after_agreeing = hold
+    reply = node.save()
+    assert named.wait(60.0)
+    thread = threading.Thread(target=close)
+    thread.start()
+    until(lambda: node.saver.worker._closed)
+    go.set()
+    thread.join(60.0)
+    assert reply.answer()[0] and closed == [1], 'answered before the node says that it is being cleaned up'
 
 
 def trajectory(moved: bool, unplaced: int = 0) -> Found:
