@@ -199,6 +199,16 @@ def test_unexpected_errors_give_one_line_and_an_exit_code(
     assert capsys.readouterr().out == 'still printing\n'
 
 
+def test_command_whose_reader_has_ended_fails_without_a_word(capsys: pytest.CaptureFixture[str]) -> None:
+    """As that of `head`: what was not printed is unknown, so scripts must not believe that all is well."""
+
+    def body(options: object) -> int:
+        raise BrokenPipeError
+
+    assert console.run(process_bag.parser(), body, ['bag']) == 1
+    assert capsys.readouterr() == ('', '')
+
+
 def test_programming_error_is_raised() -> None:
     def body(options: object) -> int:
         raise ZeroDivisionError

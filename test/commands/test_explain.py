@@ -7,6 +7,7 @@ import math
 import os
 import re
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -209,3 +210,15 @@ def test_position_with_a_comma_is_accepted(maps: Path, capsys: pytest.CaptureFix
     for wrong in ('3.0,', '-3.0,4.0', '3.0,nan', 'a,b', '1,2,3'):
         assert code_of(explain.main, maps, wrong) != 0
         assert 'explain: error' in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(('state', 'sign', 'other'), [(1, 1.0, 'free'), (0, -1.0, 'occupied')])
+def test_readings_that_would_change_a_cell_are_like_those_against_it(state: int, sign: float, other: str) -> None:
+    nats = sign * np.array([9.0, -0.5, -2.0])
+    found: Any = SimpleNamespace(data=sign * 6.5, prior=sign * 0.5, traversed=False, readings=np.arange(3), nats=nats)
+    maps: Any = None
+    assert explain._decisive_evidence(maps, found, state) == (
+        f'to be {other} it takes 7.0 nats more: 4 more readings like the one with the most evidence for {other}'
+    )
+    found.nats = np.abs(nats) * sign
+    assert 'so far no single reading gives' in explain._decisive_evidence(maps, found, state)

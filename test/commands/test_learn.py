@@ -7,13 +7,14 @@ import json
 import math
 import os
 import re
+import shlex
 from pathlib import Path
 
 import pytest
 import yaml
 from drive_samples import backwards_sensors, code_of, everything_in, mapped, tape, write_tape
 
-from forward_grid_mapper.commands import learn
+from forward_grid_mapper.commands import learn, process_bag
 from forward_grid_mapper.core.common.parameters import Parameters
 from forward_grid_mapper.files import drawing
 from forward_grid_mapper.files.learned_text import write_new_file
@@ -144,9 +145,18 @@ def test_existing_file_is_not_overwritten(tmp_path: Path, bag: Path, capsys: pyt
     taken = tmp_path / 'mine.yaml'
     taken.write_text('mine')
     before = everything_in(tmp_path)
-    for path, expected in ((taken, 'exists'), (tmp_path, 'exists'), (tmp_path / 'none' / 'x.yaml', 'not a folder')):
+    # nor is a file made elsewhere, on a disk that is not mounted
+    link = tmp_path / 'link.yaml'
+    link.symlink_to(tmp_path / 'disk' / 'x.yaml')
+    for path, expected in (
+        (taken, 'exists'),
+        (tmp_path, 'exists'),
+        (link, 'exists'),
+        (tmp_path / 'none' / 'x.yaml', 'not a folder'),
+    ):
         message = output_of(capsys, bag, '-o', path, code=1)
         assert message.startswith('learn: error: ') and expected in message and '--output' in message
+    link.unlink()
     assert everything_in(tmp_path) == before and taken.read_text() == 'mine'
 
 
@@ -191,3 +201,14 @@ def test_warnings_about_wrong_input(tmp_path: Path, capsys: pytest.CaptureFixtur
     text = ' '.join(output_of(capsys, bag, '--rounds', 1).split())
     assert 'are copies of others' in text and 'recorded twice' in text
     assert 'the sensors seem to be rotated by 180 degrees; check the poses of the sensors' in text
+
+
+def test_printed_command_maps_the_same_readings() -> None:
+    part = ['--start', '3', '--duration', '20', '--poses', 'true.csv']
+    topics = ['--odom-topic', '/odom', '--range-topics', '/a', '/b']
+    options = learn.parser().parse_args(['one bag', *part, *topics])
+    line = shlex.split(learn._mapping(options, Path('learned.yaml')))
+    given = process_bag.parser().parse_args(line[line.index('process_bag') + 1 :])
+    assert (given.bags, given.params) == (['one bag'], 'learned.yaml')
+    for name in ('start', 'duration', 'poses', 'odom_topic', 'range_topics'):
+        assert getattr(given, name) == getattr(options, name)

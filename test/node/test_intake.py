@@ -171,6 +171,7 @@ def test_topics_are_subscribed_once_and_unsubscribed() -> None:
     assert qualities['a'].reliability == qualities['b'].reliability == ReliabilityPolicy.BEST_EFFORT
     robot.range(100.0, number=7)
     robot.range(100.0, number=90, topic=1)
+    robot.odometry(100.0, number=30)
     intake.unsubscribe()
     assert not intake.listening and node.subscribed == {} and intake.subscriptions == {}
     assert 'sonar' not in intake.heard
@@ -178,7 +179,8 @@ def test_topics_are_subscribed_once_and_unsubscribed() -> None:
     # messages published meanwhile do not count as lost
     robot.range(101.0, number=500)
     robot.range(101.0, number=500, topic=1)
-    assert intake.lost == 0
+    robot.odometry(101.0, number=500)
+    assert intake.lost == intake.odometry_lost == 0
 
 
 def test_middleware_that_reports_no_losses_is_subscribed_all_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -243,6 +245,11 @@ def test_recent_losses_give_a_warning_and_rare_log_lines(
     now += LOSS_WARNING
     assert robot.intake.faults() == [] and robot.intake.loss_note()
     assert len(robot.node.warned) == 2
+    # losses after a reset are logged, though they are fewer than those before
+    now += 1.0
+    robot.intake.forget()
+    robot.range(101.0, number=8)
+    assert '1 Range and 0 odometry' in robot.intake.faults()[0] and len(robot.node.warned) == 3
 
 
 def test_jump_back_of_time_gives_a_warning() -> None:

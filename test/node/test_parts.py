@@ -7,6 +7,7 @@ import json
 import sqlite3
 import threading
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -29,6 +30,7 @@ from forward_grid_mapper.files.journal_format import Contents
 from forward_grid_mapper.files.journal_reader import read
 from forward_grid_mapper.node import consistency_check, em, main, map_publishers, saver
 from forward_grid_mapper.node.intake import AT_ONCE
+from forward_grid_mapper.node.mapper_node import MapperNode
 from forward_grid_mapper.node.run_input import RunInput
 
 OK, WARN = b'\x00', b'\x01'
@@ -542,3 +544,31 @@ def test_buffer_of_the_node_is_thinned_in_the_background(inside: Callable[..., I
     found = node.live.snapshot()
     assert found.grid == everything.grid
     assert np.array_equal(found.probability, everything.probability(), equal_nan=True)
+
+
+def test_reset_empties_the_published_maps_before_work_on_new_ones_begins() -> None:
+    """Late subscribers get no forgotten map, and a run that is still going on belongs to the maps before."""
+    done: list[str] = []
+
+    def noting(*names: str) -> Any:
+        return SimpleNamespace(**{name.partition(' ')[2]: partial(done.append, name) for name in names})
+
+    journal = SimpleNamespace(take=partial(done.append, 'journal take'), reset=lambda: '; they are kept')
+    associator = SimpleNamespace(buffer=range(7), clear=lambda parameters: done.append('readings clear'))
+    node: Any = SimpleNamespace(
+        parameters=None,
+        journal=journal,
+        associator=associator,
+        intake=noting('intake forget'),
+        trajectory=noting('trajectory begin'),
+        maps=noting('maps clear'),
+        em=noting('em reset'),
+        feed=noting('feed reset'),
+    )
+    answers: list[tuple[bool, str]] = []
+    reply: Any = SimpleNamespace(send=lambda *answer: answers.append(answer))
+    MapperNode.reset(node, reply)
+    assert answers == [(True, '7 readings and all maps were deleted; they are kept')]
+    assert done[:2] == ['journal take', 'readings clear']
+    assert set(done[2:4]) == {'intake forget', 'trajectory begin'}
+    assert done[4] == 'maps clear' and set(done[5:]) == {'em reset', 'feed reset'}

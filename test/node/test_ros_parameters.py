@@ -20,6 +20,7 @@ from forward_grid_mapper.core.common.errors import ParameterError
 from forward_grid_mapper.core.common.parameters import TABLE, Parameters
 from forward_grid_mapper.core.messages.message_types import Pose2
 from forward_grid_mapper.files.parameter_file import load_parameters
+from forward_grid_mapper.node.mapper_node import MapperNode
 from forward_grid_mapper.node.ros_parameters import declare, descriptor, validator, with_points
 
 ROWS = {row.name: row for row in TABLE}
@@ -162,6 +163,37 @@ def test_values_set_at_run_time_are_checked_together() -> None:
 
     result = validator(lambda: now, refuse)([RosParameter('p_hit', value=0.7)])
     assert (result.successful, result.reason) == (False, 'not now')
+
+
+@pytest.mark.parametrize('mapping', [False, True])
+def test_values_set_at_run_time_take_effect_at_once_or_after_the_journal_is_read(mapping: bool) -> None:
+    """Before that, the readings from which the online map begins again are not complete."""
+    done: list[str] = []
+    node: Any = SimpleNamespace(
+        parameters=Parameters(),
+        mapping=mapping,
+        _started=True,
+        _when_ready=[],
+        associator=SimpleNamespace(change=lambda parameters: done.append('readings')),
+        live=SimpleNamespace(change=lambda parameters: done.append('live')),
+        online=SimpleNamespace(change=lambda parameters: done.append('online')),
+        feed=SimpleNamespace(restart_online=lambda: done.append('begins again')),
+        _map_frame=SimpleNamespace(timeout=0.0),
+        _live_timer=SimpleNamespace(timer_period_ns=0, reset=lambda: done.append('timer')),
+    )
+
+    def accepted(**values: Any) -> list[str]:
+        done.clear()
+        MapperNode._accept(node, node.parameters.varied(values))
+        return [*done]
+
+    assert accepted(pose_timeout=0.75) == ['readings', 'live', 'online'] and node._map_frame.timeout == 0.75
+    # otherwise the old period ends first
+    assert accepted(publish_rate=4.0)[3:] == ['timer'] and node._live_timer.timer_period_ns == 250_000_000
+    assert accepted(p_hit=0.6)[3:] == ['begins again'] * mapping
+    for work in node._when_ready:
+        work()
+    assert done[3:] == ['begins again']
 
 
 def test_read_only_parameters_can_be_set_before_configure() -> None:

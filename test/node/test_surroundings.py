@@ -14,6 +14,7 @@ from robot import Robot
 from sensor_msgs.msg import Range
 
 from forward_grid_mapper.node.surroundings import Surroundings
+from forward_grid_mapper.node.trajectory import Trajectory
 
 
 @pytest.mark.slow
@@ -65,3 +66,31 @@ def test_reason_for_missing_messages(published: dict[str, str], expected: str) -
         count_publishers=published.__contains__,
     )
     assert Surroundings(node, {}).absent('Range', ['/sonar']) == expected
+
+
+@pytest.mark.parametrize(
+    ('stamps', 'reported'),
+    [
+        # a static transform has no other stamp
+        ((0, 0, 0), [False, True, True]),
+        ((5, 6, 7), [False, True, True]),
+        # the last transform of a node that has ended
+        ((5, 5, 5), [False, False, False]),
+        ((None, 0, None), [False, False, False]),
+    ],
+)
+def test_other_publisher_of_the_correction_is_reported_while_it_publishes(
+    stamps: tuple[int | None, ...], reported: list[bool]
+) -> None:
+    own = SimpleNamespace(sent_at=lambda stamp: False)
+    trajectory: Any = SimpleNamespace(
+        _foreign=None,
+        _out=own,
+        on=True,
+        obstacle='',
+        listening=lambda: True,
+        frame='map',
+        _associator=SimpleNamespace(map_frame='odom'),
+    )
+    found = [Trajectory.contested(trajectory, lambda target, source, stamp=stamp: stamp) for stamp in stamps]
+    assert [text.startswith('another node publishes the transform from map to odom') for text in found] == reported

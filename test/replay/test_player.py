@@ -137,3 +137,10 @@ def test_clock_is_not_behind_the_next_message() -> None:
             latest = time
         else:
             assert time == latest
+
+
+def test_jumps_of_all_rounds_are_counted() -> None:
+    made = player(FakeBag(('odom', START), ('odom', START + 3600 * NANOSECONDS)), Log())
+    for _ in range(3):
+        made.play(1.0, 'replaying')
+    assert made.jumps == 3

@@ -85,6 +85,7 @@ def test_replay_follows_a_clock_that_was_set_back(wall: Wall) -> None:
             for topic in ('odom', 'sonar'):
                 wall.seconds = max(wall.seconds, timeline.due(topic, START - run * 5 * SECOND + i * SECOND // 10))
     assert wall.seconds == pytest.approx(109.8, abs=0.2)
+    assert timeline.jumps == 1, 'not one for each topic'
 
 
 def test_long_delay_is_not_caught_up(wall: Wall) -> None:

@@ -8,7 +8,8 @@ import pytest
 
 from forward_grid_mapper.commands import process_bag
 from forward_grid_mapper.commands.many_workers import beside, check_apart
-from forward_grid_mapper.scale import extra
+from forward_grid_mapper.core.common.errors import OutputError
+from forward_grid_mapper.scale import extra, work_folder
 
 
 @pytest.mark.parametrize(
@@ -77,3 +78,27 @@ def test_work_next_to_the_results_is_accepted(
     (tmp_path / 'link').symlink_to('real')
     monkeypatch.chdir(tmp_path)
     check_apart(Path(output), Path(work))
+
+
+def test_file_of_a_job_is_replaced_whole_or_not_at_all(tmp_path: Path) -> None:
+    path = tmp_path / 'drives' / '0001.json'
+    for text in ('first', 'second'):
+        with work_folder.whole(path) as partial:
+            partial.write_text(text)
+        assert path.read_text() == text
+    with pytest.raises(KeyboardInterrupt), work_folder.whole(path) as partial:
+        partial.write_text('third')
+        raise KeyboardInterrupt
+    assert path.read_text() == 'second' and [*path.parent.iterdir()] == [path]
+
+
+def test_job_begins_in_a_folder_with_only_the_remains_of_a_killed_one(tmp_path: Path) -> None:
+    folder = work_folder.WorkFolder(str(tmp_path / 'work'))
+    (tmp_path / 'work').mkdir()
+    (tmp_path / 'work' / f'.manifest.json.0a1b2c3d{work_folder.PARTIAL}').write_text('{')
+    assert not folder.begin({'bags': ['a']})
+    assert folder.begin({'bags': ['a']})
+    (tmp_path / 'other').mkdir()
+    (tmp_path / 'other' / 'letter.txt').write_text('')
+    with pytest.raises(OutputError, match='is not empty, and contains no job'):
+        work_folder.WorkFolder(str(tmp_path / 'other')).begin({'bags': ['a']})

@@ -25,6 +25,15 @@ def test_odometry_without_drift_is_unchanged() -> None:
     assert drifted(poses, NONE, 0) == pytest.approx(poses)
 
 
+def test_drift_does_not_depend_on_whole_turns_of_the_yaw() -> None:
+    angle = np.linspace(0.0, 4 * np.pi, 400)
+    poses = np.column_stack([np.cos(angle), np.sin(angle), angle + np.pi / 2])
+    wrapped = poses.copy()
+    wrapped[:, 2] = (poses[:, 2] + np.pi) % (2 * np.pi) - np.pi
+    expected, found = (drifted(each, LEVELS['high'], 1) for each in (poses, wrapped))
+    assert found == pytest.approx(expected)
+
+
 def test_yaw_error_grows_with_the_square_root_of_the_distance() -> None:
     level = Drift(math.radians(2.0), 0.0, 0.0, 0.0, 0.0)
     ends = [drifted(straight(way), level, seed)[-1, 2] for way in (4.0, 36.0) for seed in range(150)]

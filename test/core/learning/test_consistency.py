@@ -17,6 +17,7 @@ import pytest
 
 from forward_grid_mapper.core.common.parameters import Parameters
 from forward_grid_mapper.core.common.readings import Readings
+from forward_grid_mapper.core.learning import consistency
 from forward_grid_mapper.core.learning.consistency import consistency_warnings
 from forward_grid_mapper.core.learning.trial_maps import MountedReadings
 from forward_grid_mapper.core.mapping import Mapper
@@ -194,6 +195,20 @@ def test_wrong_poses_give_one_warning_with_the_cause(name: str) -> None:
     warnings = warnings_of(change(office()))
     assert len(warnings) == 1, 'one cause, one warning'
     assert re.search(expected, warnings[0]), warnings
+
+
+@pytest.mark.parametrize(
+    ('quantity', 'plus', 'minus'),
+    [
+        (consistency.TIME, 'are 0.10 s (±0.01 s) too early', 'are 0.10 s (±0.01 s) too late'),
+        (consistency.YAW, 'by 6 degrees (±0.6) to the left of', 'by 6 degrees (±0.6) to the right of'),
+        (consistency.FORWARD, 'are 0.10 m (±0.01 m) forward of', 'are 0.10 m (±0.01 m) behind'),
+        (consistency.LEFT, 'are 0.10 m (±0.01 m) to the left of', 'are 0.10 m (±0.01 m) to the right of'),
+    ],
+)
+def test_sign_of_an_offset_is_that_of_its_words(quantity: consistency.Quantity, plus: str, minus: str) -> None:
+    assert plus in consistency._words(quantity, 0.1, 0.01)
+    assert minus in consistency._words(quantity, -0.1, 0.01)
 
 
 def test_remedy_includes_the_offset_that_is_set() -> None:
