@@ -35,10 +35,12 @@ class Reply:
         with self._lock:
             if self._response is not None:
                 return
-            self._response, header = response, self._header
-        self._service.open.discard(self)
-        if header is not None:
-            self._service.transmit(response, header)
+            self._response = response
+            try:
+                self._transmit()
+            finally:
+                # not before, so that `end` waits for this answer: the service is destroyed after it
+                self._service.open.discard(self)
 
     def fail(self, why: str) -> None:
         """Answer that the call failed; the reason is in `message`, if the response has one."""
@@ -48,9 +50,12 @@ class Reply:
     def arrived(self, header: Any) -> None:
         """Note the client's header, which the executor only has after the handler returned."""
         with self._lock:
-            self._header, response = header, self._response
-        if response is not None:
-            self._service.transmit(response, header)
+            self._header = header
+            self._transmit()
+
+    def _transmit(self) -> None:
+        if self._header is not None and self._response is not None:
+            self._service.transmit(self._response, self._header)
 
 
 def answered(handler: Callable[[Reply], None], reply: Reply, log: Callable[[str], object]) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 from contextlib import nullcontext
 from types import SimpleNamespace
 from typing import Any
@@ -154,3 +155,25 @@ def test_calls_that_nobody_has_taken_fail_when_the_service_ends() -> None:
         (False, 'it ends', 'second'),
     ]
     assert not replies and not service.open
+
+
+def test_answer_on_its_way_is_sent_before_the_service_ends() -> None:
+    node, replies = Serving(), list[Reply]()
+    service = DeferredService(node, Trigger, 'later', replies.append)
+    node.call('one')
+    sending, go_on, send = threading.Event(), threading.Event(), service.transmit
+
+    def slow(response: Any, header: Any) -> None:
+        sending.set()
+        assert go_on.wait(60.0)
+        send(response, header)
+
+    service.transmit = slow  # type: ignore[method-assign]
+    worker = threading.Thread(target=replies[0].send, args=(True, 'done'))
+    worker.start()
+    assert sending.wait(60.0)
+    threading.Timer(0.2, go_on.set).start()
+    service.end('it ends')
+    assert [response.message for response, _ in node.sent] == ['done']
+    worker.join()
+    assert not service.open
