@@ -86,7 +86,7 @@ class Saver:
         self._ended = False
 
     def close(self, seconds: float) -> None:
-        """Wait at most so many seconds for maps that are being written; no folder of them remains after that."""
+        """Wait at most this many seconds for maps that are being written; no folder of them remains after that."""
         self.worker.close(seconds)
         with self._agreeing:
             self._ended = True
@@ -119,7 +119,7 @@ class Saver:
         self.worker.put(work, lambda why: reply.send(False, f'save_maps failed: {why}'))
 
     def _write(self, maps: MapSet, account: Account, explained: int, found: Found | None, named: ExitStack) -> str:
-        """Write a folder, and return the response; from when it gets its name, `named` keeps `close` waiting."""
+        """Write a folder, and return the response; once it gets its name, `named` keeps `close` waiting."""
         newer = account.accepted - explained
         warnings = account.source['warnings']
         if newer > 0:
