@@ -19,14 +19,13 @@ from .mcap_chunks import indexed_messages
 from .repair import Problem, reasons_of, remedies_of, repair_hint
 from .salvage import Scan
 from .source import RosbagsSource, Source, close_all, one_line
-from .unpacking import NoSpaceError, UnpackedMessages, open_unpacked
+from .unpacking import ZSTD_MAGIC, NoSpaceError, UnpackedMessages, open_unpacked
 
 _KINDS: dict[bytes, tuple[str, type[Scan]]] = {
     scan_mcap.MAGIC: ('.mcap', scan_mcap.McapScan),
     scan_sqlite3.MAGIC: ('.db3', scan_sqlite3.Sqlite3Scan),
     scan_rosbag1.MAGIC: ('.bag', scan_rosbag1.Rosbag1Scan),
 }
-_ZSTD_MAGIC = b'\x28\xb5\x2f\xfd'
 
 STORAGE_SUFFIXES = ('.mcap', '.db3', '.bag', '.mcap.zstd', '.db3.zstd')
 """Suffixes of storage files."""
@@ -96,7 +95,7 @@ def _open_folder(folder: Path) -> Opened:
     present = storage_files(folder)
     if metadata is None:
         if len(present) == 1:
-            source = _open_file(present[0])
+            source = _open_unlisted(present[0])
             return Opened([source], [(present[0], source)], [])
         if present:
             raise BagError(_of_several(folder, present))
@@ -190,10 +189,15 @@ def _open_each(files: list[Path], compression: str) -> tuple[list[tuple[Path, So
 
 
 def _open_single(file: Path) -> Source:
-    # only the folder's metadata state the compression of its files or their messages
     metadata = _read_metadata(file.parent)
-    listed = metadata is not None and file.name in metadata.files
-    return _open_listed(file, metadata.compression if metadata is not None and listed else '')
+    if metadata is None or file.name not in metadata.files:
+        return _open_unlisted(file)
+    return _open_listed(file, metadata.compression)
+
+
+def _open_unlisted(file: Path) -> Source:
+    # only metadata state whether messages are compressed, but compressed ones can be recognised
+    return UnpackedMessages(_open_file(file), marked=True)
 
 
 def _open_listed(file: Path, compression: str) -> Source:
@@ -217,7 +221,7 @@ def _open_file(file: Path) -> Source:
     if scanner is None:
         if not magic:
             raise BagError(f'{file} is empty (0 bytes); nothing was recorded.')
-        if magic.startswith(_ZSTD_MAGIC):
+        if magic.startswith(ZSTD_MAGIC):
             raise BagError(f'{file} is compressed; unpack it with `zstd -d {quoted(file)}` or open its bag folder.')
         raise BagError(f'{file} is not a bag: it is neither an MCAP, nor a sqlite3, nor a ROS 1 bag file.')
     reason = ''

@@ -18,6 +18,8 @@ from .source import RawMessage, Source, one_line
 _PIECE = 1 << 20
 """Bytes that are decompressed at once."""
 
+ZSTD_MAGIC = b'\x28\xb5\x2f\xfd'
+
 
 NO_SPACE = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 """Errors of a full disk, or an exhausted quota."""
@@ -28,11 +30,21 @@ class NoSpaceError(BagError):
 
 
 class UnpackedMessages:
-    """A source whose messages are compressed one by one."""
+    """A source whose messages are compressed one by one.
 
-    def __init__(self, source: Source) -> None:
+    Parameters
+    ----------
+    source : Source
+    marked : bool
+        Whether only messages that begin with the mark of zstd are compressed, because no metadata state it.
+    """
+
+    def __init__(self, source: Source, *, marked: bool = False) -> None:
         self._source = source
         self.channels, self.span = source.channels, source.span
+        # a message in CDR begins with 0, while one of ROS 1 may begin with any number
+        self._plain = {channel.key for channel in source.channels if channel.encoding != 'cdr'} if marked else set()
+        self._mark = ZSTD_MAGIC if marked else b''
 
     @property
     def damage(self) -> str | None:
@@ -46,6 +58,9 @@ class UnpackedMessages:
     def messages(self, keys: Collection[int]) -> Iterator[RawMessage]:
         """Yield the messages of these channels by log time; empty, which is invalid, if they cannot be decompressed."""
         for key, time, data in self._source.messages(keys):
+            if key in self._plain or not data.startswith(self._mark):
+                yield key, time, data
+                continue
             try:
                 raw = unpack('zstd', data, LARGEST_MESSAGE)
             except Exception:  # too large, or errors of the library for damaged bytes

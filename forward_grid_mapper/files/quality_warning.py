@@ -14,6 +14,7 @@ from ..core.drive_fit import fit_warnings
 from ..core.learning.agreement import contradiction
 from ..core.learning.consistency import consistency_warnings
 from ..core.learning.input_warnings import input_warnings
+from ..core.learning.range_warnings import STILL
 from ..core.maps.map_set import MapSet
 from ..core.messages.message_types import Pose2
 
@@ -83,10 +84,26 @@ def quality_warning(maps: MapSet) -> str:
     count, unexplained = len(maps.readings), int(np.count_nonzero(maps.unexplained))
     if count < ENOUGH or unexplained <= TOO_MANY * count:
         return ''
+    cause = (
+        'odometry has one pose for all of them: does its driver fill in the pose, and not only the velocity (twist)? '
+        'Are its stamps set?'
+        if _from_one_place(maps.readings)
+        else 'are the poses of the sensors, odometry, the field of view and changed parameters right?'
+    )
     return (
         f'{unexplained} of {count} readings are most likely random measurements: the map does not fit the readings; '
-        'are the poses of the sensors, odometry, the field of view and changed parameters right?'
+        f'{cause}'
     )
+
+
+def _from_one_place(readings: Readings) -> bool:
+    """Return whether no sensor moves or turns; a small drive may change ranges too little for `input_warnings`."""
+    # each reading is compared with the first of its sensor, since small steps may add up
+    _, first, sensor = np.unique(readings.sensor, return_index=True, return_inverse=True)
+    start = first[sensor]
+    moved = np.hypot(readings.x - readings.x[start], readings.y - readings.y[start])
+    turned = np.abs(np.remainder(readings.yaw - readings.yaw[start] + np.pi, 2 * np.pi) - np.pi)
+    return bool(moved.max() <= STILL[0] and turned.max() <= STILL[1])
 
 
 def contradiction_of_halves(maps: MapSet) -> float | None:

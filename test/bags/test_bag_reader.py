@@ -119,6 +119,15 @@ def test_compressed_mcap_is_read(tmp_path: Path, compression: str) -> None:
     if compression == 'file':
         with pytest.raises(BagError, match='zstd -d'), Bag(alone):
             pass
+        return
+    # without metadata.yaml, nothing but the messages shows that they are compressed
+    folder = tmp_path / 'without_metadata'
+    folder.mkdir()
+    shutil.copy(alone, folder)
+    for path in (alone, folder):
+        with Bag(path) as opened:
+            assert list(opened.messages(Topics(('/sonar',), ''))) == expected
+            assert not opened.undecodable
 
 
 def test_messages_are_in_order_of_log_time(tmp_path: Path) -> None:

@@ -22,8 +22,8 @@ def test_warning_if_no_map_explains_the_readings(tmp_path: Path) -> None:
     maps = Mapper(Parameters()).run(drive)
     assert quality_warning(maps) == ''
     rng = np.random.default_rng(1)
-    # random echoes, all from one place
-    wild = dataclasses.replace(drive, x=0 * drive.x, y=0 * drive.y, z=rng.uniform(0.2, 1.0, len(drive)) * drive.z_max)
+    # random echoes
+    wild = dataclasses.replace(drive, z=rng.uniform(0.2, 1.0, len(drive)) * drive.z_max)
     wild = Mapper(Parameters()).run(wild)
     warning = quality_warning(wild)
     assert 'are the poses of the sensors' in warning
@@ -36,6 +36,17 @@ def test_warning_if_no_map_explains_the_readings(tmp_path: Path) -> None:
     with pytest.raises(OutputError, match='too late'):
         write_results(tmp_path / 'refused', wild, {}, np.zeros((0, 2)), 'wild', agree=refuse)
     assert [path.name for path in tmp_path.iterdir()] == ['maps'], 'whoever waited for the maps has gone'
+
+
+def test_odometry_that_has_only_velocities_is_named_if_the_map_does_not_fit() -> None:
+    drive = door_drive(2).readings
+    rng = np.random.default_rng(1)
+    columns = dict.fromkeys(('x', 'y', 'yaw'), np.zeros(len(drive)))
+    standing = dataclasses.replace(drive, **columns, z=rng.uniform(0.2, 1.0, len(drive)) * drive.z_max)
+    assert 'not only the velocity (twist)' in quality_warning(Mapper(Parameters()).run(standing))
+    # a robot that turns on the spot has odometry
+    turning = dataclasses.replace(standing, yaw=np.linspace(0.0, 6.0, len(drive)))
+    assert 'are the poses of the sensors' in quality_warning(Mapper(Parameters()).run(turning))
 
 
 def test_warning_if_no_reading_has_an_echo() -> None:

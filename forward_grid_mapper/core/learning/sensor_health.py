@@ -323,7 +323,8 @@ def health_warning(table: dict[str, SensorHealth]) -> str:
     suspects = [f'{name} ({row.verdict_text})' for name, row in table.items() if row.suspect]
     if not suspects:
         return ''
-    return (
-        f'{"a sensor stands" if len(suspects) == 1 else f"{len(suspects)} sensors stand"} out from the others: '
-        f'{", ".join(suspects)}; broken, covered, or with a wrong pose?'
-    )
+    if len(table) == 1:
+        finding = 'the only sensor does not fit the map'
+    else:
+        finding = f'{"a sensor stands" if len(suspects) == 1 else f"{len(suspects)} sensors stand"} out from the others'
+    return f'{finding}: {", ".join(suspects)}; broken, covered, or with a wrong pose?'

@@ -204,7 +204,11 @@ def test_sensors_without_readings_and_a_single_sensor() -> None:
     assert str(table['sonar_04']) == 'no readings: few readings'
     assert table['sonar_05'].verdict == 'ok'
     alone = dataclasses.replace(readings, sensor=np.zeros(len(readings), np.int32), sensor_names=('only',))
-    assert sensor_health(mapped(alone))['only'].verdict == 'ok'
+    table = sensor_health(mapped(alone))
+    assert table['only'].verdict == 'ok'
+    # without others, it cannot differ from them
+    warning = health_warning({'only': dataclasses.replace(table['only'], verdict='mostly random')})
+    assert 'the only sensor' in warning and 'only (mostly random)' in warning and 'others' not in warning
 
 
 def test_distance_of_first_obstacles() -> None:
