@@ -73,8 +73,8 @@ FASTEST = 15.0
 """No robot with sonars drives this many metres a second; 0.2 m/s in centimetres look like 20 m/s."""
 
 NEXT = 4
-"""The slowest of the ways to this many next readings of a sensor counts: after a jump back of the clock, readings of two
-places alternate, and one of the next was measured a moment later."""
+"""The slowest of the ways to this many next readings of a sensor counts: after a jump back of the clock, readings of
+two places alternate, and one of the next was measured a moment later."""
 
 HANDFUL, SWEEPS = 0.02, 2
 """Largest fraction of the readings, and of rounds of all sensors, that should not make the map much larger; one wrong

@@ -81,6 +81,9 @@ OF_SILENCE, INSTEAD, NONE = ('nan_range', 'too_near', 'below_min_range'), 0.05, 
 """Reasons for which values that drivers send for 'no echo' are rejected. If at least the first fraction of the readings
 of most sensors is rejected so, and at most the second fraction of all others has no echo, they stand for it."""
 
+SEVERAL = 2
+"""This many sensors suffice for NaN: a single one may be broken."""
+
 
 OF_POSES = {
     'unknown_extrinsics',
@@ -255,8 +258,12 @@ def _instead_of_no_echo(
             # a sensor of which all readings were left out is known, but has no count
             if numbers[0] or by_frame.get(frame)
         ]
-        most = sum(share >= INSTEAD for share in shares) > len(shares) / 2
-        if most and max(INSTEAD * received, ENOUGH) <= count <= MANY * received and reason not in known:
+        concerned, fewest = sum(share >= INSTEAD for share in shares), INSTEAD * received
+        enough = concerned > len(shares) / 2
+        if reason == 'nan_range':
+            # no object makes a range NaN, so a few sensors of a robot in a small room suffice
+            enough, fewest = concerned >= SEVERAL, 0.0
+        if enough and max(fewest, ENOUGH) <= count <= MANY * received and reason not in known:
             warnings.append(
                 f'{count} of {received} readings were rejected as {reason}, and no other reading is without an echo: '
                 f'does the driver send this if there is no echo? {_SILENT_DRIVER[0].upper()}{_SILENT_DRIVER[1:]}'

@@ -80,6 +80,19 @@ def test_warning_of_no_echo_that_is_rejected() -> None:
     assert sensor_rejections({frame: {'pose_gap': 10} for frame in accepted}, accepted) == []
 
 
+def test_nan_of_a_few_sensors_stands_for_no_echo() -> None:
+    """In a small room, most sensors always have an echo."""
+    accepted = {f'sonar_{k}': (300, 0) for k in range(8)}
+    of_two = {'sonar_0': {'nan_range': 20}, 'sonar_1': {'nan_range': 20}}
+    (warning,) = sensor_rejections(of_two, accepted)
+    assert warning.startswith('40 of 2440 readings were rejected as nan_range')
+    # a single sensor may be broken, and an object may be too near to two sensors
+    assert sensor_rejections({'sonar_0': {'nan_range': 40}}, accepted) == []
+    assert sensor_rejections({frame: {'too_near': 20} for frame in of_two}, accepted) == []
+    # but not if other readings have no echo
+    assert sensor_rejections(of_two, {**accepted, 'sonar_7': (300, 90)}) == []
+
+
 def test_reasons_of_poses_are_known_reasons() -> None:
     assert OF_POSES | CHOSEN < set(REASONS)
 
