@@ -154,5 +154,7 @@ def _yaw(path: Path | str, number: int, quaternion: Sequence[float]) -> float:
     x, y, z, w = quaternion
     yaw = yaw_of(x, y, z, w)
     if yaw is None:
-        raise InputError(f'{path}, line {number}: the quaternion is not normalised, or the robot is tilted too far')
+        raise InputError(
+            f'{path}, line {number}: the quaternion is not normalised, or the robot is tilted too far or upside down'
+        )
     return yaw

@@ -216,7 +216,8 @@ class MapFrame:
         way = f'from {self._map_frame} (map_frame) to {self._frame}'
         waiting = f'{len(self._held)} odometry messages wait for it, {self.dropped} were dropped'
         if self._lack is TILTED:
-            return f"TF's transform {way} is tilted, not finite, or its quaternion is not normalised: {waiting}"
+            what = 'is tilted, upside down or not finite, or its quaternion is not normalised'
+            return f"TF's transform {way} {what}: {waiting}"
         if self._lack is LATE:
             return f"TF's transform {way} arrives later than pose_timeout, or has stopped: {waiting}"
         return f'TF has no transform {way}: {waiting}; is a localisation node running?'

@@ -73,8 +73,8 @@ def planar_pose(position: Any, orientation: Any) -> Pose2 | None:
     Returns
     -------
     Pose2 or None
-        `yaw` is the heading of the x axis. None if a number is not finite, the quaternion is not normalised, or the x
-        axis leaves the plane too steeply (`quaternions`).
+        `yaw` is the heading of the x axis. None if a number is not finite, the quaternion is not normalised, the x axis
+        leaves the plane too steeply, or the z axis points down (`quaternions`).
     """
     q = orientation
     return planar_pose_of(float(position.x), float(position.y), float(q.x), float(q.y), float(q.z), float(q.w))

@@ -40,6 +40,12 @@ def heading_of(x: float, y: float, z: float) -> float | None:
 
 
 def yaw_of(x: float, y: float, z: float, w: float) -> float | None:
-    """Return the heading of a quaternion's x axis, radians; None if it is not normalised, or too steep."""
+    """Return the heading of a robot, whose x axis looks ahead, radians.
+
+    None if the quaternion is not normalised, if x is too steep, or if z points down: the projection on the plane would
+    exchange left and right.
+    """
     rotation = rotation_of(x, y, z, w)
-    return None if rotation is None else heading_of(rotation[0][0], rotation[1][0], rotation[2][0])
+    if rotation is None or rotation[2][2] <= 0.0:
+        return None
+    return heading_of(rotation[0][0], rotation[1][0], rotation[2][0])

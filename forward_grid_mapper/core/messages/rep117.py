@@ -108,8 +108,8 @@ CHOSEN = {'over_range', 'paused'}
 
 
 ODOMETRY_REASONS = {
-    'bad_pose': 'the pose is not finite, impossibly far away or tilted too far, or its quaternion is not normalised; '
-    'have the driver fill in the orientation: x, y, z, w are 0, 0, sin(yaw/2), cos(yaw/2)',
+    'bad_pose': 'the pose is not finite, impossibly far away, tilted too far or upside down, or its quaternion is not '
+    'normalised; have the driver fill in the orientation: x, y, z, w are 0, 0, sin(yaw/2), cos(yaw/2)',
     'long_frame_id': 'the frame_id or child_frame_id has more than 255 characters',
     'unprintable_frame_id': 'the frame_id or child_frame_id has characters that cannot be printed',
     'ahead_of_others': 'the stamp is more than a second ahead of those before and after it: do two nodes publish '

@@ -75,6 +75,14 @@ def test_yaw_is_that_of_the_x_axis(yaw: float, pitch: float) -> None:
     assert yaw_of(*product(product(turn, nod), roll)) == pytest.approx(yaw)
 
 
+def test_robot_upside_down_has_no_yaw() -> None:
+    """Its left side is at its right in the plane: a rolled robot has a yaw, and one that is turned over has none."""
+    for roll, upright in ((1.5, True), (-1.5, True), (1.6, False), (math.pi, False), (-2.0, False)):
+        assert (yaw_of(math.sin(roll / 2), 0.0, 0.0, math.cos(roll / 2)) is not None) == upright
+    # the quaternion of NED in ENU
+    assert yaw_of(math.sqrt(0.5), math.sqrt(0.5), 0.0, 0.0) is None
+
+
 def test_steep_x_axis_has_no_yaw() -> None:
     assert yaw_of(0.0, math.sin(0.6), 0.0, math.cos(0.6)) is None
     assert yaw_of(0.0, math.sin(0.5), 0.0, math.cos(0.5)) == pytest.approx(0.0)
