@@ -13,10 +13,15 @@ from forward_grid_mapper.core import warm_up
 
 COMMAND = (sys.executable, '-m', 'forward_grid_mapper', 'warm_up')
 
+COMPILED = 1100.0
+"""Seconds within which all kernels are compiled, also on a busy machine."""
+
 
 def test_second_warm_up_compiles_nothing() -> None:
     for _ in range(2):
-        done = subprocess.run(COMMAND, capture_output=True, text=True, check=True, env=dict(os.environ), timeout=600)
+        done = subprocess.run(
+            COMMAND, capture_output=True, text=True, check=True, env=dict(os.environ), timeout=COMPILED
+        )
     assert 'nothing to compile' in done.stdout
     assert [line.split(' …')[0] for line in done.stdout.splitlines()[:4]] == [
         'live map kernels',
