@@ -115,7 +115,7 @@ def _densest(points: NDArray[np.float64], place: NDArray[np.float64]) -> NDArray
 
 
 class _Echoes:
-    """Readings with an echo, of which those near a place are found without a look at all."""
+    """Readings with an echo, sorted, so that those near a place are found without a pass over all of them."""
 
     def __init__(self, readings: Readings) -> None:
         r = readings.select(np.argsort(readings.x, kind='stable'))
