@@ -91,9 +91,16 @@ def test_position_that_is_not_finite_is_rejected(convert: Convert, x: float) -> 
     assert convert(turned(0.5, 0.0), x) is None
 
 
-@everywhere
-def test_yaw_of_an_upside_down_frame_is_mirrored(convert: Convert) -> None:
-    assert convert((math.cos(0.25), math.sin(0.25), 0.0, 0.0)) == pytest.approx((1.0, 2.0, 0.5))
+UPSIDE_DOWN = (math.cos(0.25), math.sin(0.25), 0.0, 0.0)
+
+
+@pytest.mark.parametrize('convert', [by_bag, by_tf])
+def test_sensor_upside_down_looks_along_its_x_axis(convert: Convert) -> None:
+    assert convert(UPSIDE_DOWN) == pytest.approx((1.0, 2.0, 0.5))
+
+
+def test_robot_upside_down_has_no_pose_in_the_plane() -> None:
+    assert by_odometry(UPSIDE_DOWN) is None
 
 
 @pytest.mark.parametrize('pitch', [0.0, 0.5, -0.9])
