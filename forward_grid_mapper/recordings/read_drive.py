@@ -72,7 +72,8 @@ def read_drive(
     BagError
         If the bag cannot be read, or topics are missing or ambiguous.
     InputError
-        If no reading got a pose, or none is in that part; names the reason.
+        If no reading got a pose, or none is in that part, or ranges are farther than sonars can measure; names the
+        reason.
     """
     # reading a pipe would wait, and a device may have no end
     plain = Path(path).is_dir() or Path(path).is_file()
@@ -120,6 +121,8 @@ def read_drive(
         error = _nothing_associated(associator, lookup, spans, undecodable, poses, moving)
         # the rest of the messages may be in the part that cannot be read
         raise type(error)(f'{error}. {damage}') if damage else error
+    if not parameters.association.max_range and (impossible := associator.limits.impossible):
+        raise InputError(f'{path}: {impossible}. If the sensors do measure so far, set the parameter max_range as well')
     first, last = associator.buffer.stamps
     source = {
         'bag': readable(path),

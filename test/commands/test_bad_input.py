@@ -65,6 +65,37 @@ def error_of_drive(capsys: pytest.CaptureFixture[str], folder: Path, drive: Tape
     return error_of(capsys, folder, bag, '-o', folder / 'maps', *options)
 
 
+# ---- units
+
+
+def in_units(ranges: float, limits: float) -> Tape:
+    """The drive with ranges and max_range that are this many times as large."""
+    return tape()._replace(
+        ranges=[m._replace(range=m.range * ranges, max_range=m.max_range * limits) for m in tape().ranges]
+    )
+
+
+@pytest.mark.parametrize(
+    ('by', 'expected'),
+    [((100, 100), 'are ranges and limits in centimetres'), ((1, 100), 'is it in centimetres')],
+    ids=['all in centimetres', 'limits in centimetres'],
+)
+def test_ranges_that_no_sonar_measures_are_an_error_and_not_a_huge_map(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], by: tuple[float, float], expected: str
+) -> None:
+    error = error_of_drive(capsys, tmp_path, in_units(*by))
+    assert expected in error and 'set the parameter max_range' in error
+    if by == (1, 100):
+        report = mapped(tmp_path / 'bag', tmp_path / 'maps', '-q', '--set', 'max_range=5.0')
+        assert report['counts']['accepted'] == COUNT
+
+
+def test_no_limit_is_a_warning(tmp_path: Path) -> None:
+    drive = tape()._replace(ranges=[m._replace(max_range=3.4e38) for m in tape().ranges])
+    (warning,) = mapped(write_tape(tmp_path / 'bag', drive), tmp_path / 'maps', '-q')['warnings']
+    assert 'does the driver state no limit' in warning
+
+
 # ---- bags
 
 

@@ -122,6 +122,24 @@ class LimitWatch:
         found = {frame: _suspicion(samples.values) for frame, samples in sorted(self._of.items())}
         return [f'sensor {frame}: {suspicion}' for frame, suspicion in found.items() if suspicion]
 
+    @property
+    def impossible(self) -> str:
+        """What is wrong with max_range, if no sonar measures so far; '' if it is plausible, or if none is stated.
+
+        A map with such a limit takes minutes, and shows nothing but the error.
+        """
+        values = np.concatenate([np.empty((0, 3)), *(samples.values for samples in self._of.values())])
+        finite = values[_usable(values)].T
+        if len(finite[0]) < ENOUGH or _middle(finite[2]) >= STATED:
+            return ''
+        return _far(finite)
+
+
+def _usable(values: Floats) -> NDArray[np.bool_]:
+    """Return which messages have a range and a limit, shape (N,)."""
+    ranges, _, limits = values.T
+    return np.isfinite(ranges) & (ranges > 0) & (limits > 0) & (limits < np.inf)
+
 
 def _suspicion(values: Floats, sensor: NDArray[np.int64] | None = None) -> str:
     """Return what is wrong with ranges and limits, in words; '' if there is no suspicion.
@@ -133,8 +151,7 @@ def _suspicion(values: Floats, sensor: NDArray[np.int64] | None = None) -> str:
     sensor : int64, shape (N,), optional
         The sensor of each, if they are those of all sensors.
     """
-    ranges, _, limits = values.T
-    used = np.isfinite(ranges) & (ranges > 0) & (limits > 0) & (limits < np.inf)
+    used = _usable(values)
     if np.count_nonzero(used) < ENOUGH:
         return ''
     finite = values[used].T
