@@ -19,7 +19,7 @@ from .core.mapping import Mapper, Watch
 from .core.maps.map_set import MapSet
 from .core.messages.extrinsics import Mount
 from .core.messages.message_types import Pose2, RangeMessage
-from .core.messages.mounts import FARTHEST, TURN
+from .core.messages.mounts import FARTHEST_MOUNT, TURN
 from .core.messages.pose_association import PoseAssociator
 from .core.messages.rep117 import ODOMETRY_REASONS, REASONS, rejection_warnings, sensor_rejections
 from .files.pose_files import poses_from_csv, poses_from_tum
@@ -64,10 +64,10 @@ class Sonar:
             raise InputError(f'{self}: not a number: {error}') from None
         if abs(self.yaw) > TURN:
             raise InputError(f'yaw = {self.yaw:g} rad is more than a full turn; did you mean radians({self.yaw:g})?')
-        if math.hypot(self.x, self.y) > FARTHEST:
+        if math.hypot(self.x, self.y) > FARTHEST_MOUNT:
             raise InputError(
-                f'x = {self.x:g} m and y = {self.y:g} m are more than {FARTHEST:g} m from the middle of the robot; '
-                'both are in metres'
+                f'x = {self.x:g} m and y = {self.y:g} m are more than {FARTHEST_MOUNT:g} m from the middle of the '
+                'robot; both are in metres'
             )
         if abs(self.pitch) > math.pi / 2:
             raise InputError(

@@ -30,7 +30,7 @@ STATES = {1: 'occupied', 0: 'free', -1: 'not observed'}
 SHOWN = 5
 COUNTS = ('-n', '--readings')
 
-FARTHEST = 1e9
+LARGEST_COORDINATE = 1e9
 """Metres; no map is larger, and indices of cells remain integers."""
 
 LEAST_TYPICAL = 0.05
@@ -117,7 +117,7 @@ def explanation_data(
 
 def _on_map(maps: MapArchive, x: float, y: float) -> bool:
     """Return whether a place is in a cell of the map; decided by the index, since edges are rounded."""
-    if not math.isfinite(x) or not math.isfinite(y) or max(abs(x), abs(y)) > FARTHEST:
+    if not math.isfinite(x) or not math.isfinite(y) or max(abs(x), abs(y)) > LARGEST_COORDINATE:
         return False
     (row,), (column,) = maps.grid.cells_of(np.array([x]), np.array([y]))
     return bool(0 <= row < maps.grid.height and 0 <= column < maps.grid.width)

@@ -24,7 +24,7 @@ from .common.readings import Readings
 from .common.words import counted
 from .learning.lost_walls import Stretch, lost_walls
 from .learning.model_update import learn
-from .learning.standard_errors import LEARNED, Estimate, estimates
+from .learning.standard_errors import LEARNED, ParameterEstimate, parameter_estimates
 from .mapping import Mapper
 from .maps.map_set import MapSet
 from .search.search import Progress
@@ -117,7 +117,7 @@ class Learned:
     ----------
     parameters : Parameters
         The given ones with the learned values.
-    estimates : dict of str to Estimate
+    estimates : dict of str to ParameterEstimate
         The learned values with their standard errors; empty if already the first update was rejected.
     rounds : tuple of Round
         From round 0, with the initial values, to the last one, rejected or not.
@@ -133,7 +133,7 @@ class Learned:
     """
 
     parameters: Parameters
-    estimates: dict[str, Estimate]
+    estimates: dict[str, ParameterEstimate]
     rounds: tuple[Round, ...]
     accepted: int
     converged: bool
@@ -235,7 +235,7 @@ def learn_jointly(
             break
     found = {}
     if len(accepted) > 1:
-        found = estimates(learned_from.forward_model().at(last.parameters.model), learned_from.ml)
+        found = parameter_estimates(learned_from.forward_model().at(last.parameters.model), learned_from.ml)
     number = len(accepted) - 1
     warnings = (*_quality_warnings(history, number, converged), *_value_warnings(found, last.parameters.model))
     return Learned(last.parameters, found, tuple(history), number, converged, last, warnings)
@@ -304,7 +304,7 @@ def _quality_warnings(rounds: list[Round], accepted: int, converged: bool) -> li
     return warnings
 
 
-def _value_warnings(found: dict[str, Estimate], model: ModelParameters) -> list[str]:
+def _value_warnings(found: dict[str, ParameterEstimate], model: ModelParameters) -> list[str]:
     """Return warnings about values with little information."""
     warnings = []
     for name, estimate in found.items():

@@ -33,7 +33,7 @@ from numpy.typing import NDArray
 from ..core.common.errors import ParameterError
 from ..core.common.parameters import TABLE, Parameters
 from ..core.common.readings import Readings
-from ..core.messages.map_extent import FARTHEST
+from ..core.messages.map_extent import LARGEST_COORDINATE
 from ..core.messages.message_types import NANOSECONDS
 
 DRIVE = re.compile(r'drive_(\d{4,})\.journal')
@@ -253,7 +253,7 @@ class Contents:
             self.fault('points of the path are damaged')
             return
         points = np.frombuffer(data, '<f8').reshape(-1, 2)
-        good = (np.abs(points) < FARTHEST).all(axis=1)
+        good = (np.abs(points) < LARGEST_COORDINATE).all(axis=1)
         if not good.all():
             self.fault('points of the path are not finite')
         self.path += [(x, y) for x, y in points[good].tolist()]
@@ -295,7 +295,9 @@ def _wrong(rows: NDArray[np.void], sensors: Mapping[int, str]) -> Iterator[tuple
     Comparisons are written so that NaN fails them.
     """
     z, z_max = rows['z'], rows['z_max']
-    on_earth = (np.abs(rows['x']) < FARTHEST) & (np.abs(rows['y']) < FARTHEST) & np.isfinite(rows['yaw'])
+    on_earth = (
+        (np.abs(rows['x']) < LARGEST_COORDINATE) & (np.abs(rows['y']) < LARGEST_COORDINATE) & np.isfinite(rows['yaw'])
+    )
     yield 'their pose is not finite or impossibly far away', ~on_earth
     yield 'their range is not between 0 and the largest range', ~((z > 0) & (z <= z_max) & (z_max < np.inf))
     yield (

@@ -14,7 +14,7 @@ from ..core.drive_fit import fit_warnings
 from ..core.learning.agreement import contradiction
 from ..core.learning.consistency import consistency_warnings
 from ..core.learning.input_warnings import input_warnings
-from ..core.learning.range_warnings import STILL
+from ..core.learning.range_warnings import STANDSTILL_STEP
 from ..core.maps.map_set import MapSet
 from ..core.messages.message_types import Pose2
 
@@ -103,7 +103,7 @@ def _from_one_place(readings: Readings) -> bool:
     start = first[sensor]
     moved = np.hypot(readings.x - readings.x[start], readings.y - readings.y[start])
     turned = np.abs(np.remainder(readings.yaw - readings.yaw[start] + np.pi, 2 * np.pi) - np.pi)
-    return bool(moved.max() <= STILL[0] and turned.max() <= STILL[1])
+    return bool(moved.max() <= STANDSTILL_STEP[0] and turned.max() <= STANDSTILL_STEP[1])
 
 
 def contradiction_of_halves(maps: MapSet) -> float | None:

@@ -15,7 +15,7 @@ from forward_grid_mapper.core.common.parameters import Parameters
 from forward_grid_mapper.core.common.readings import Readings
 from forward_grid_mapper.core.joint_learning import LIKELIHOOD_DROP, Learned, learn_jointly, settle
 from forward_grid_mapper.core.learning.lost_walls import lost_walls
-from forward_grid_mapper.core.learning.standard_errors import estimates
+from forward_grid_mapper.core.learning.standard_errors import parameter_estimates
 from forward_grid_mapper.core.mapping import Mapper
 from forward_grid_mapper.core.maps.map_set import MapSet
 from forward_grid_mapper.core.sensor.forward_model import ForwardModel
@@ -75,7 +75,7 @@ def test_without_smooth_walls_values_are_accepted_with_bias() -> None:
     model = learned.parameters.model
     world = recording.world
     known = settle(ForwardModel(readings, world.grid, Parameters().varied(PLAIN).model), world.reference)
-    sure = estimates(ForwardModel(readings, world.grid, known), world.reference)
+    sure = parameter_estimates(ForwardModel(readings, world.grid, known), world.reference)
     for name, truth in (('p_rand', 0.08), ('p_lost', 0.1)):
         assert sure[name].low < truth < sure[name].high
     # with cells of 10 cm, distances to their centres have small errors

@@ -7,8 +7,8 @@ Small offsets, of stamps or of the poses of the sensors, are then estimated from
 
 Ranges that are too large by a factor look like odometry that is too small by it.
 
-It costs some thirty maps of at most `MOST` readings each, however long the drive is, and a dozen larger ones for each
-offset that is estimated.
+It costs some thirty maps of at most `MOST_READINGS` readings each, however long the drive is, and a dozen larger ones
+for each offset that is estimated.
 """
 
 from __future__ import annotations
@@ -24,23 +24,33 @@ import numpy as np
 from ..common.parameters import Parameters
 from ..common.readings import Readings
 from ..messages.message_types import NANOSECONDS, Pose2
-from .sensor_calibration import FORWARD, LEFT, QUANTITIES, TIME, YAW, Estimate, Quantity, as_good, estimates
+from .sensor_calibration import (
+    FORWARD,
+    LEFT,
+    QUANTITIES,
+    TIME,
+    YAW,
+    OffsetEstimate,
+    Quantity,
+    as_good,
+    offset_estimates,
+)
 from .trial_maps import MountedReadings, coarse, trial_map
 
-MOST, ENOUGH = 800, 300
+MOST_READINGS, LEAST_READINGS = 800, 300
 """Most readings of the part that is mapped; with fewer than the second, no check is made."""
 
-GAIN = 0.1
+LEAST_GAIN_A_READING = 0.1
 """Nats a reading by which the map with a fault undone must be better. In sound drives it is at most 0.05."""
 
-TOTAL = 50.0
+LEAST_TOTAL_GAIN = 50.0
 """Nats by which it must be better in total."""
 
-LONG, THIN = 4000, 1200
+OFFSET_PART, OFFSET_READINGS = 4000, 1200
 """Readings of the part from which offsets are guessed, and how many of them are mapped: offsets show over a longer part
 than other faults."""
 
-SUSPICIOUS = 12.0
+LEAST_GUESS_GAIN = 12.0
 """Nats that the best guess of an offset must gain for the offset to be estimated."""
 
 FACTORS = (0.3048, 0.5, 2.0, 3.281)
@@ -49,26 +59,26 @@ FACTORS = (0.3048, 0.5, 2.0, 3.281)
 WIDTHS = (1 / 6, 0.25, 0.5, 2.0, 3.0)
 """Factors of the stated field of view that are tried."""
 
-NARROW_GAIN = 0.07
+LEAST_NARROW_GAIN = 0.07
 """Nats a reading by which the map with narrower cones must be better. In sound drives it is always worse, also if
 odometry drifts; it is at most 0.04 better if the sensors are rotated by 15°."""
 
 WIDEST = 1.5
 """Largest half field of view, radians."""
 
-STEPS = 40
+LEAST_TRAVEL_STEPS = 40
 """Fewest steps of `travel` for checks of the direction of travel."""
 
-ALIGNED, AWRY = 0.9, 0.7
+ALIGNED_LENGTH, SCATTERED_LENGTH = 0.9, 0.7
 """Mean resultant lengths of angles: at least the first if they agree, at most the second if they do not."""
 
 SAME_YAW = 0.01
 """The yaw of odometry is constant if it varies by less than this, radians."""
 
-SPINNING = 10.0
+FASTEST_TURN = 10.0
 """No robot does half of its turning faster than this many radians a second; a yaw in degrees looks so."""
 
-TURNED, TURNING = 2 * math.pi, 0.05
+LEAST_FAST_TURN, LEAST_FAST_TIME = 2 * math.pi, 0.05
 """Least total turn, radians, and least fraction of the time with such fast turns: odometry may jump now and then."""
 
 CHECK = 'check the poses of the sensors on the robot (parameters, --sensor or transforms)'
@@ -93,35 +103,35 @@ def consistency_warnings(
     Swapped left and right are not found in a straight drive, and shifted stamps hardly in a slow one.
     """
     drive = MountedReadings.of(readings, extrinsics)
-    if len(drive) < ENOUGH:
+    if len(drive) < LEAST_READINGS:
         return []
     # a yaw in degrees looks random, and so may look like any other fault
-    if warning := _spinning(drive) or _axes(drive):
+    if warning := _yaw_unit_warning(drive) or _axis_warning(drive):
         return [warning]
     parameters = parameters or Parameters()
-    part = drive.moving_part(MOST)
+    part = drive.moving_part(MOST_READINGS)
     p = coarse(parameters, part.readings)
     count, given = len(part), trial_map(part.readings, p).objective
     tried = ((trial_map(fault.undone, p).objective - given, fault) for fault in _faults(part))
     gain, fault = max(tried, key=itemgetter(0))
-    known = gain / count if gain >= max(fault.least * count, TOTAL) else 0.0
-    found = _offsets(drive, parameters, known)
+    known = gain / count if gain >= max(fault.least * count, LEAST_TOTAL_GAIN) else 0.0
+    found = _significant_offsets(drive, parameters, known)
     if found and found[0].gain > known * found[0].readings:
-        return [_of_offset(found, parameters.association.range_time_offset)]
+        return [_offset_warning(found, parameters.association.range_time_offset)]
     return [_explained(fault.warning, count, gain)] if known else []
 
 
-def _offsets(drive: MountedReadings, parameters: Parameters, known: float) -> list[Estimate]:
+def _significant_offsets(drive: MountedReadings, parameters: Parameters, known: float) -> list[OffsetEstimate]:
     """Return the significant offsets that may explain the readings better than by `known`, nats a reading."""
-    part = drive.moving_part(LONG).thinned(THIN)
+    part = drive.moving_part(OFFSET_PART).thinned(OFFSET_READINGS)
     p = coarse(parameters, part.readings)
     given, suspects = trial_map(part.readings, p).objective, {}
     for quantity in QUANTITIES:
         tried = ((trial_map(quantity.corrected(part, guess), p).objective, guess) for guess in quantity.guesses)
         best, guess = max(tried)
-        if best - given >= max(SUSPICIOUS, known * len(part)):
+        if best - given >= max(LEAST_GUESS_GAIN, known * len(part)):
             suspects[quantity] = guess
-    return estimates(drive, suspects, parameters) if suspects else []
+    return offset_estimates(drive, suspects, parameters) if suspects else []
 
 
 def _explained(warning: str, count: int, gain: float) -> str:
@@ -129,7 +139,7 @@ def _explained(warning: str, count: int, gain: float) -> str:
     return f'{warning} ({better})'
 
 
-def _of_offset(found: list[Estimate], time_offset: float) -> str:
+def _offset_warning(found: list[OffsetEstimate], time_offset: float) -> str:
     """Return the warning about the best of the estimates; `time_offset` is the one already added to stamps, seconds."""
     best, *others = found
     causes = [best, *(each for each in others if as_good(best, each))]
@@ -168,12 +178,12 @@ class _Fault(NamedTuple):
 
     warning: str
     undone: Readings
-    least: float = GAIN
+    least: float = LEAST_GAIN_A_READING
 
 
 def _faults(drive: MountedReadings) -> Iterator[_Fault]:
     """Yield all faults that are checked."""
-    yield from _of_axes(drive)
+    yield from _axis_faults(drive)
     x, y, yaw = drive.robot
     for factor in FACTORS:
         much = f'{factor:.3g} times as far as' if factor > 1 else f'1/{1 / factor:.3g} as far as'
@@ -189,11 +199,11 @@ def _faults(drive: MountedReadings) -> Iterator[_Fault]:
             f'the field of view is stated as {stated} degrees, but the readings fit about {fitting} degrees; is it '
             'half of the angle, or twice the angle? Correct the driver, or set the parameter field_of_view',
             replace(drive.readings, half_angle=half),
-            NARROW_GAIN if width < 1 else GAIN,
+            LEAST_NARROW_GAIN if width < 1 else LEAST_GAIN_A_READING,
         )
 
 
-def _of_axes(drive: MountedReadings) -> Iterator[_Fault]:
+def _axis_faults(drive: MountedReadings) -> Iterator[_Fault]:
     """Yield wrong signs and axes."""
     x, y, yaw = drive.robot
     forward, left, turn = drive.extrinsics
@@ -224,14 +234,18 @@ def _of_axes(drive: MountedReadings) -> Iterator[_Fault]:
         )
 
 
-def _spinning(drive: MountedReadings) -> str:
+def _yaw_unit_warning(drive: MountedReadings) -> str:
     """Return a warning if the yaw is in another unit than radians, so that the robot seems to turn far too fast."""
     known, first = np.unique(drive.readings.stamp, return_index=True)
     seconds = np.diff(known) / NANOSECONDS
     turned = np.abs(np.remainder(np.diff(drive.robot[2, first]) + math.pi, 2 * math.pi) - math.pi)
-    fast = turned > SPINNING * seconds
+    fast = turned > FASTEST_TURN * seconds
     total = float(turned.sum())
-    if total < TURNED or turned[fast].sum() < total / 2 or seconds[fast].sum() < TURNING * seconds.sum():
+    if (
+        total < LEAST_FAST_TURN
+        or turned[fast].sum() < total / 2
+        or seconds[fast].sum() < LEAST_FAST_TIME * seconds.sum()
+    ):
         return ''
     speed = float(np.median(turned[fast] / seconds[fast]))
     return (
@@ -240,21 +254,21 @@ def _spinning(drive: MountedReadings) -> str:
     )
 
 
-def _axes(drive: MountedReadings) -> str:
+def _axis_warning(drive: MountedReadings) -> str:
     """Return a warning if the direction of travel turns against the yaw, so that an axis is wrong; otherwise ''.
 
     A robot drives forwards, or backwards, or, if it is holonomic, in any direction. None drives to the right whenever
     it turns to the left, and to the left whenever it turns to the right.
     """
     at, directions = drive.travel()
-    if len(at) < STEPS:
+    if len(at) < LEAST_TRAVEL_STEPS:
         return ''
     yaw = drive.robot[2, at]
     # doubled angles, for which backwards equals forwards, do not help if the robot drives along two axes only
     for times in (1, 2):
         with_yaw = abs(np.mean(np.exp(1j * times * (directions - yaw))))
         against_yaw = np.mean(np.exp(1j * times * (directions + yaw)))
-        if abs(against_yaw) >= ALIGNED and with_yaw <= AWRY:
+        if abs(against_yaw) >= ALIGNED_LENGTH and with_yaw <= SCATTERED_LENGTH:
             break
     else:
         return ''

@@ -14,82 +14,83 @@ import numpy as np
 
 from ..common.grid import cone_boxes
 from ..common.readings import Floats, Readings
-from .range_warnings import ENOUGH, LEAST, STILL, moving, range_warnings, sensors, turned
+from .range_warnings import LEAST_OF_PART, LEAST_READINGS, STANDSTILL_STEP, moving, range_warnings, sensors, turned
 
-COPIES = 0.3
+LEAST_COPIES = 0.3
 """Fraction of the readings that must be copies of others; a driver may send a value twice now and then."""
 
-COARSE, CROWDED = 1_000_000, 2.0
+WHOLE_SECOND_TOLERANCE, LEAST_IN_A_SECOND = 1_000_000, 2.0
 """All stamps are within this many nanoseconds after a whole second if nanosec is not filled in, or is in another unit;
 and a sensor has at least this many readings in each such second."""
 
-AT_ONCE = 0.3
+SAME_STAMP_SHARE = 0.3
 """Fraction of the readings of a sensor that have the stamp of another one with a different range."""
 
-SHARED = 100
+LEAST_PAIRS = 100
 """Fewest pairs of readings of a frame whose ranges are tested for a period; few may have one at random."""
 
 LONGEST_PERIOD = 32
 """Most sensors with one frame; no ring of sonars has more."""
 
-REPEATS = 0.25
+REPEAT_RATIO = 0.25
 """A range differs from that of one round of sensors before by at most this fraction of the difference between
 neighbours. Upper quartiles are compared, since some readings are random."""
 
-DIFFERS = 0.3
+NEIGHBOUR_DIFFERENCE = 0.3
 """Metres by which the ranges of neighbouring sensors differ in at least a quarter of the cases; less may be noise."""
 
-AS_BEFORE = 0.05
+LARGEST_TURN = 0.05
 """Steps between readings during which the sensor turned by more, radians, are ignored: a sensor on a servo, or on a
-robot that spins, detects the same objects periodically. So are steps in which it moved by more than `DIFFERS`: sensors
-that share a frame measure from one place, and after a jump back of the clock, readings of two places alternate.
+robot that spins, detects the same objects periodically. So are steps in which it moved by more than
+`NEIGHBOUR_DIFFERENCE`: sensors that share a frame measure from one place, and after a jump back of the clock, readings
+of two places alternate.
 """
 
-STANDS = 8.0
+LEAST_STANDSTILL = 8.0
 """Shortest standstill whose ranges are checked, seconds."""
 
-BLOCK = 3.0
+BLOCK_LENGTH = 3.0
 """Seconds of the blocks of a standstill whose median ranges are compared."""
 
-CHANGED, OFTEN = 0.4, 0.3
+RANGE_CHANGE, CHANGED_SHARE = 0.4, 0.3
 """If the robot in fact drives, at least the second fraction of the medians differ from the median of all by more than
 the first, metres. People who pass a standing robot change the ranges of a sensor only now and then."""
 
-MOST_CHANGED = 0.6
+CHANGED_SENSORS = 0.6
 """Fraction of the sensors whose ranges must change: people walk in front of some, but driving changes most."""
 
-STUCK, MOVED = 0.97, 2.0
+STUCK_SHARE, STUCK_DISTANCE = 0.97, 2.0
 """A stuck sensor repeats one range to the millimetre in this fraction of its readings, over this many metres of
 driving."""
 
-TURNED = 0.5
+STUCK_TURN = 0.5
 """The robot must have turned by this many radians as well: along a straight wall, a range stays the same."""
 
-STOPPED, PAUSES = 10.0, 3.0
+STOPPED_FOR, STOPPED_PAUSES = 10.0, 3.0
 """A sensor stopped if others sent readings for this many seconds after its last one, and for this many times its
 longest pause before."""
 
 FASTEST = 15.0
 """No robot with sonars drives this many metres a second; 0.2 m/s in centimetres look like 20 m/s."""
 
-NEXT = 4
+NEXT_READINGS = 4
 """The slowest of the ways to this many next readings of a sensor counts: after a jump back of the clock, readings of
 two places alternate, and one of the next was measured a moment later."""
 
-HANDFUL, SWEEPS = 0.02, 2
+OUTLIER_SHARE, OUTLIER_SWEEPS = 0.02, 2
 """Largest fraction of the readings, and of rounds of all sensors, that should not make the map much larger; one wrong
 pose affects a round."""
 
-MULTIPLE = 4.0
+LEAST_AREA_RATIO = 4.0
 """The map is at least this many times as large with them."""
 
-LARGE = 400.0
+LEAST_AREA = 400.0
 """They add at least this many square metres; for small maps it does not matter."""
 
 
 def input_warnings(readings: Readings) -> list[str]:
     """Return warnings about readings; empty if there is no suspicion."""
-    if len(readings) < ENOUGH:
+    if len(readings) < LEAST_READINGS:
         return []
     if text := _whole_seconds(readings):
         # the other checks compare readings in their order
@@ -109,7 +110,7 @@ def _copies(readings: Readings) -> str:
     same = (stamp[1:] == stamp[:-1]) & (sensor[1:] == sensor[:-1]) & (z[1:] == z[:-1])
     copies = int(np.count_nonzero(same))
     # readings that all have one stamp are another fault
-    if copies < COPIES * len(z) or len(np.unique(stamp)) < 0.1 * len(z) / max(len(readings.sensor_names), 1):
+    if copies < LEAST_COPIES * len(z) or len(np.unique(stamp)) < 0.1 * len(z) / max(len(readings.sensor_names), 1):
         return ''
     return (
         f'{copies} of {len(z)} readings are copies of others (same sensor, stamp and range), and their evidence '
@@ -120,10 +121,10 @@ def _copies(readings: Readings) -> str:
 
 def _whole_seconds(readings: Readings) -> str:
     """Check for stamps whose nanoseconds are not filled in or in another unit, and for constant stamps."""
-    if readings.stamp.min() < 0 or np.any(readings.stamp % 1_000_000_000 >= COARSE):
+    if readings.stamp.min() < 0 or np.any(readings.stamp % 1_000_000_000 >= WHOLE_SECOND_TOLERANCE):
         return ''
     most = max((len(mine) / len(np.unique(mine.stamp // 1_000_000_000)) for _, mine in sensors(readings)), default=0.0)
-    if most < CROWDED:
+    if most < LEAST_IN_A_SECOND:
         return ''
     stamps = 'all stamps are equal' if np.ptp(readings.stamp) == 0 else 'all stamps are whole seconds'
     return (
@@ -136,14 +137,16 @@ def _shared_frame(readings: Readings) -> str:
     suspects = []
     for name, mine in sensors(readings):
         z = mine.z
-        one_pose = (turned(mine) <= AS_BEFORE) & (np.hypot(np.diff(mine.x), np.diff(mine.y)) <= DIFFERS)
-        differ = (mine.stamp[1:] == mine.stamp[:-1]) & (np.abs(np.diff(z)) > DIFFERS)
-        at_once = np.count_nonzero(differ & one_pose) > AT_ONCE * len(z)
+        one_pose = (turned(mine) <= LARGEST_TURN) & (np.hypot(np.diff(mine.x), np.diff(mine.y)) <= NEIGHBOUR_DIFFERENCE)
+        differ = (mine.stamp[1:] == mine.stamp[:-1]) & (np.abs(np.diff(z)) > NEIGHBOUR_DIFFERENCE)
+        at_once = np.count_nonzero(differ & one_pose) > SAME_STAMP_SHARE * len(z)
         steps = np.abs(np.diff(z))[one_pose]
         neighbours = float(np.quantile(steps, 0.75)) if len(steps) else 0.0
         periods = range(3, min(LONGEST_PERIOD, len(z) // 10) + 1)
         rounds = [float(np.quantile(np.abs(z[k:] - z[:-k]), 0.75)) for k in periods]
-        takes_turns = len(steps) >= SHARED and neighbours > DIFFERS and min(rounds) < REPEATS * neighbours
+        takes_turns = (
+            len(steps) >= LEAST_PAIRS and neighbours > NEIGHBOUR_DIFFERENCE and min(rounds) < REPEAT_RATIO * neighbours
+        )
         if at_once or takes_turns:
             suspects.append(name)
     if not suspects:
@@ -159,17 +162,17 @@ def _speed(readings: Readings) -> str:
     """Check for poses in other units than metres: most of the time, the robot seems to drive far too fast."""
     speeds = []
     for _, mine in sensors(readings):
-        speed = np.full(len(mine) - NEXT, np.inf)
-        for k in range(1, NEXT + 1):
+        speed = np.full(len(mine) - NEXT_READINGS, np.inf)
+        for k in range(1, NEXT_READINGS + 1):
             seconds = (mine.stamp[k:] - mine.stamp[:-k]) / 1e9
             way = np.hypot(mine.x[k:] - mine.x[:-k], mine.y[k:] - mine.y[:-k])
             # readings of a robot that stands do not count
-            ahead = np.where(way > STILL[0], way, 0.0)[: len(speed)]
+            ahead = np.where(way > STANDSTILL_STEP[0], way, 0.0)[: len(speed)]
             after = seconds[: len(speed)]
             speed = np.minimum(speed, np.divide(ahead, after, out=np.full(len(speed), np.inf), where=after > 0.0))
         speeds.append(speed[(speed > 0.0) & np.isfinite(speed)])
     driven = np.concatenate(speeds) if speeds else np.zeros(0)
-    if len(driven) < ENOUGH or np.median(driven) < FASTEST:
+    if len(driven) < LEAST_READINGS or np.median(driven) < FASTEST:
         return ''
     return (
         f'the poses move at {np.median(driven):.0f} m/s: are they in millimetres or centimetres, or are their stamps '
@@ -187,9 +190,9 @@ def _standing(readings: Readings) -> str:
     if not names:
         return ''
     for begin, end in _still_times(per_sensor[0]):
-        changed = [_changes(mine, begin, end) for mine in per_sensor]
+        changed = [_ranges_change(mine, begin, end) for mine in per_sensor]
         judged = [change for change in changed if change is not None]
-        if len(judged) >= max(1, len(names) // 2) and sum(judged) >= MOST_CHANGED * len(judged):
+        if len(judged) >= max(1, len(names) // 2) and sum(judged) >= CHANGED_SENSORS * len(judged):
             lasted += (end - begin) / 1e9
     if not lasted:
         return ''
@@ -206,31 +209,31 @@ def _still_times(mine: Readings) -> Iterable[tuple[int, int]]:
         # steps below the threshold may add up
         part = slice(first, last)
         wide = max(float(np.ptp(mine.x[part])), float(np.ptp(mine.y[part])))
-        if mine.stamp[last - 1] - mine.stamp[first] >= STANDS * 1e9 and wide <= STILL[0]:
+        if mine.stamp[last - 1] - mine.stamp[first] >= LEAST_STANDSTILL * 1e9 and wide <= STANDSTILL_STEP[0]:
             yield int(mine.stamp[first]), int(mine.stamp[last - 1])
 
 
-def _changes(mine: Readings, begin: int, end: int) -> bool | None:
+def _ranges_change(mine: Readings, begin: int, end: int) -> bool | None:
     """Return whether the ranges change as if the robot drives; None if there are too few readings."""
     inside = (mine.stamp >= begin) & (mine.stamp <= end)
-    z, block = mine.z[inside], ((mine.stamp[inside] - begin) / (BLOCK * 1e9)).astype(np.int64)
+    z, block = mine.z[inside], ((mine.stamp[inside] - begin) / (BLOCK_LENGTH * 1e9)).astype(np.int64)
     parts = np.split(z, np.flatnonzero(np.diff(block)) + 1)
-    medians = np.array([np.median(part) for part in parts if len(part) >= LEAST])
-    if len(medians) * BLOCK < STANDS / 2:
+    medians = np.array([np.median(part) for part in parts if len(part) >= LEAST_OF_PART])
+    if len(medians) * BLOCK_LENGTH < LEAST_STANDSTILL / 2:
         return None
-    return bool(np.mean(np.abs(medians - np.median(z)) > CHANGED) >= OFTEN)
+    return bool(np.mean(np.abs(medians - np.median(z)) > RANGE_CHANGE) >= CHANGED_SHARE)
 
 
 def _stuck(readings: Readings) -> str:
     suspects = []
     for name, mine in sensors(readings):
         heard = mine.z[mine.echo]
-        if len(heard) < STUCK * len(mine) or not _drove(mine):
+        if len(heard) < STUCK_SHARE * len(mine) or not _drives_and_turns(mine):
             continue
         rounded = np.rint(heard * 1000.0).astype(np.int64)
         values, counts = np.unique(rounded, return_counts=True)
         most = int(counts.argmax())
-        if counts[most] >= STUCK * len(mine):
+        if counts[most] >= STUCK_SHARE * len(mine):
             suspects.append(f'{name} ({values[most] / 1000.0:.3f} m)')
     if not suspects:
         return ''
@@ -247,7 +250,7 @@ def _stopped(readings: Readings) -> str:
         together = readings.select(readings.drive == drive)
         for name, mine in sensors(together):
             rest = float(together.stamp[-1] - mine.stamp[-1]) / 1e9
-            if rest >= max(STOPPED, PAUSES * float(np.diff(mine.stamp).max()) / 1e9):
+            if rest >= max(STOPPED_FOR, STOPPED_PAUSES * float(np.diff(mine.stamp).max()) / 1e9):
                 missing[name] = max(rest, missing.get(name, 0.0))
     if not missing:
         return ''
@@ -257,14 +260,14 @@ def _stopped(readings: Readings) -> str:
     )
 
 
-def _drove(mine: Readings) -> bool:
+def _drives_and_turns(mine: Readings) -> bool:
     path = float(np.hypot(np.diff(mine.x), np.diff(mine.y)).sum())
-    return path >= MOVED and float(np.ptp(np.unwrap(mine.yaw))) >= TURNED
+    return path >= STUCK_DISTANCE and float(np.ptp(np.unwrap(mine.yaw))) >= STUCK_TURN
 
 
 def _extent(readings: Readings) -> str:
     """Check for a few readings without which the map would be much smaller."""
-    few = min(SWEEPS * len(readings.sensor_names), int(HANDFUL * len(readings)))
+    few = min(OUTLIER_SWEEPS * len(readings.sensor_names), int(OUTLIER_SHARE * len(readings)))
     if not few:
         return ''
     boxes = cone_boxes(readings.x, readings.y, readings.yaw, readings.half_angle, readings.z)
@@ -272,7 +275,7 @@ def _extent(readings: Readings) -> str:
     reached = np.array([[-1.0], [1.0], [-1.0], [1.0]]) * boxes
     ordered = np.sort(reached, axis=1)
     whole, rest = ordered[:, -1], ordered[:, -few - 1]
-    if _area(whole) < MULTIPLE * _area(rest) or _area(whole) - _area(rest) < LARGE:
+    if _area(whole) < LEAST_AREA_RATIO * _area(rest) or _area(whole) - _area(rest) < LEAST_AREA:
         return ''
     side = int(np.argmax(whole - rest))
     middle = (rest[side] + whole[side]) / 2

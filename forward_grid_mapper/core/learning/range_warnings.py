@@ -13,56 +13,56 @@ from numpy.typing import NDArray
 
 from ..common.readings import Floats, Readings
 
-ENOUGH = 30
+LEAST_READINGS = 30
 """Fewest readings of a sensor that is checked."""
 
-STILL = 0.01, 0.01
+STANDSTILL_STEP = 0.01, 0.01
 """Metres and radians: a robot that moves by less stands still."""
 
-JUDGED = 1.0
+LEAST_DRIVEN = 1.0
 """Metres that sensors must have moved before their range limit is checked: from one place all walls may be near or
 far."""
 
-LEAST = 5
-"""Fewest readings of a sensor in such a block."""
+LEAST_OF_PART = 5
+"""Fewest readings in a block of time, or in a twelfth of the circle, that counts."""
 
-NARROW, WIDE = math.radians(3.0), math.radians(90.0)
+NARROWEST, WIDEST = math.radians(3.0), math.radians(90.0)
 """No sonar has a smaller or larger field of view than these."""
 
-REACHED = 0.6
+REACHED_SHARE = 0.6
 """max_range is too large if all echoes are within this fraction of it."""
 
-SILENT = 0.05
+LEAST_NO_ECHO = 0.05
 """At least this fraction of the readings must have no echo: in a small closed room all echoes are near, but all
 readings have one."""
 
-ECHOES = 200
+LEAST_ECHOES = 200
 """Fewest echoes for checks of the range limit."""
 
-CEILING, ABOVE = 0.05, 0.005
-"""A driver that sends a certain range for 'no echo' does so in at least the first fraction of its echoes, and at most
-the second fraction is longer."""
+SENTINEL_SHARE, BEYOND_SHARE = 0.05, 0.005
+"""A sentinel is a certain range that a driver sends for 'no echo'. At least the first fraction of the echoes has this
+range, and at most the second fraction is longer (or shorter, if it is the shortest)."""
 
-NONE = 0.01
-"""Then at most this fraction of the readings has no echo."""
+MOST_NO_ECHO = 0.01
+"""With a sentinel, at most this fraction of the readings has no echo."""
 
-SAME = 0.0005
+VALUE_TOLERANCE = 0.0005
 """Metres within which two ranges are the same value of the driver."""
 
-BELOW, DIRECTIONS = 0.05, 3
-"""Within this many metres below that range there are few echoes, unlike for a wall; and it is sent in at least this
+GAP_BELOW, LEAST_DIRECTIONS = 0.05, 3
+"""Within this many metres below a sentinel there are few echoes, unlike for a wall; and it is sent in at least this
 many twelfths of the circle."""
 
-FLOOR = 0.1
-"""Within this many metres above the shortest range there are few echoes, if it stands for 'no echo'."""
+GAP_ABOVE = 0.1
+"""Within this many metres above a sentinel that is the shortest range there are few echoes."""
 
-SCATTER = 0.5
+LARGEST_SIGMA = 0.5
 """The σ of no sonar is this many metres."""
 
 
 def range_warnings(readings: Readings) -> list[str]:
     """Return warnings about the values of readings in the order of their stamps; empty if there is no suspicion."""
-    checks = (_ceiling, _floor, _field_of_view, _reach, _scatter)
+    checks = (_high_sentinel, _low_sentinel, _field_of_view, _range_limit, _variance)
     return [text for check in checks if (text := check(readings))]
 
 
@@ -70,20 +70,20 @@ def sensors(readings: Readings) -> Iterable[tuple[str, Readings]]:
     """Yield name and readings of every sensor that has enough of them."""
     for number, name in enumerate(readings.sensor_names):
         mine = readings.sensor == number
-        if np.count_nonzero(mine) >= ENOUGH:
+        if np.count_nonzero(mine) >= LEAST_READINGS:
             yield name, readings.select(mine)
 
 
-def _ceiling(readings: Readings) -> str:
-    """Check for a range below max_range that stands for 'no echo': the longest one, which occurs again and again."""
-    heard, towards = _echoes_of_all_that_answer(readings)
-    if len(heard) < ECHOES:
+def _high_sentinel(readings: Readings) -> str:
+    """Check for a sentinel below max_range: the longest range, which occurs again and again."""
+    heard, towards = _echoes_if_no_reading_lacks_one(readings)
+    if len(heard) < LEAST_ECHOES:
         return ''
-    longest = round(float(np.quantile(heard, 1.0 - ABOVE)), 3)
-    same = np.abs(heard - longest) < SAME
-    nearly = (heard > longest - BELOW) & (heard < longest) & ~same
+    longest = round(float(np.quantile(heard, 1.0 - BEYOND_SHARE)), 3)
+    same = np.abs(heard - longest) < VALUE_TOLERANCE
+    nearly = (heard > longest - GAP_BELOW) & (heard < longest) & ~same
     count, almost = int(np.count_nonzero(same)), int(np.count_nonzero(nearly))
-    if count < CEILING * len(heard) or count < 2 * almost or not _all_around(towards[same]):
+    if count < SENTINEL_SHARE * len(heard) or count < 2 * almost or not _all_around(towards[same]):
         return ''
     return (
         f'{count / len(heard):.0%} of the echoes are at {longest:.3f} m, hardly any is longer, and no reading is '
@@ -92,20 +92,20 @@ def _ceiling(readings: Readings) -> str:
     )
 
 
-def _floor(readings: Readings) -> str:
-    """Check for a shortest range that stands for 'no echo': a driver may raise its 0 for that to min_range."""
-    heard, towards = _echoes_of_all_that_answer(readings)
-    if len(heard) < ECHOES:
+def _low_sentinel(readings: Readings) -> str:
+    """Check for a sentinel that is the shortest range: a driver may send 0, raised to min_range."""
+    heard, towards = _echoes_if_no_reading_lacks_one(readings)
+    if len(heard) < LEAST_ECHOES:
         return ''
-    shortest = round(float(np.quantile(heard, ABOVE)), 3)
-    same = np.abs(heard - shortest) < SAME
-    nearly = (heard < shortest + FLOOR) & (heard > shortest) & ~same
+    shortest = round(float(np.quantile(heard, BEYOND_SHARE)), 3)
+    same = np.abs(heard - shortest) < VALUE_TOLERANCE
+    nearly = (heard < shortest + GAP_ABOVE) & (heard > shortest) & ~same
     count, almost = int(np.count_nonzero(same)), int(np.count_nonzero(nearly))
-    if count < CEILING * len(heard) or count < 2 * almost or not _all_around(towards[same]):
+    if count < SENTINEL_SHARE * len(heard) or count < 2 * almost or not _all_around(towards[same]):
         return ''
     # what a single sensor hears, or others all the time, may be the robot
-    parts = [float(np.mean(np.abs(mine.z - shortest) < SAME)) for _, mine in sensors(readings)]
-    at_it = [part for part in parts if part >= CEILING]
+    parts = [float(np.mean(np.abs(mine.z - shortest) < VALUE_TOLERANCE)) for _, mine in sensors(readings)]
+    at_it = [part for part in parts if part >= SENTINEL_SHARE]
     if len(at_it) < min(2, len(parts)) or min(at_it) > 0.5:
         return ''
     return (
@@ -115,11 +115,11 @@ def _floor(readings: Readings) -> str:
     )
 
 
-def _echoes_of_all_that_answer(readings: Readings) -> tuple[Floats, Floats]:
+def _echoes_if_no_reading_lacks_one(readings: Readings) -> tuple[Floats, Floats]:
     """Return ranges and directions, radians, of the echoes while the robot moves; none if readings have no echo."""
     # during a standstill ranges are constant
     parts = [mine.select(mine.echo & moving(mine)) for _, mine in sensors(readings)]
-    if not parts or np.count_nonzero(~readings.echo) > NONE * len(readings):
+    if not parts or np.count_nonzero(~readings.echo) > MOST_NO_ECHO * len(readings):
         return np.zeros(0), np.zeros(0)
     return np.concatenate([mine.z for mine in parts]), np.concatenate([mine.yaw for mine in parts])
 
@@ -127,12 +127,12 @@ def _echoes_of_all_that_answer(readings: Readings) -> tuple[Floats, Floats]:
 def _all_around(yaw: Floats) -> bool:
     """Return whether directions are spread: along a wall, a constant range occurs in the same one for long."""
     sectors = np.bincount((np.remainder(yaw, 2 * math.pi) / (2 * math.pi) * 12).astype(np.int64))
-    return int(np.count_nonzero(sectors >= LEAST)) >= DIRECTIONS
+    return int(np.count_nonzero(sectors >= LEAST_OF_PART)) >= LEAST_DIRECTIONS
 
 
 def moving(mine: Readings) -> NDArray[np.bool_]:
     """Return which readings of a sensor have another position or yaw of it than the reading before."""
-    moved = (np.hypot(np.diff(mine.x), np.diff(mine.y)) > STILL[0]) | (turned(mine) > STILL[1])
+    moved = (np.hypot(np.diff(mine.x), np.diff(mine.y)) > STANDSTILL_STEP[0]) | (turned(mine) > STANDSTILL_STEP[1])
     return np.append(False, moved)
 
 
@@ -144,7 +144,7 @@ def turned(mine: Readings) -> Floats:
 
 def _field_of_view(readings: Readings) -> str:
     angle = 2 * readings.half_angle
-    odd = (angle < NARROW) | (angle > WIDE)
+    odd = (angle < NARROWEST) | (angle > WIDEST)
     if np.count_nonzero(odd) < 0.5 * len(readings):
         return ''
     degrees = math.degrees(float(np.median(angle[odd])))
@@ -159,17 +159,17 @@ def _field_of_view(readings: Readings) -> str:
     )
 
 
-def _reach(readings: Readings) -> str:
+def _range_limit(readings: Readings) -> str:
     echo = readings.echo & ~_of_fixed_distance(readings)
     heard: Floats = readings.z[echo]
-    if max(np.ptp(readings.x), np.ptp(readings.y)) < JUDGED:
+    if max(np.ptp(readings.x), np.ptp(readings.y)) < LEAST_DRIVEN:
         return ''
-    if len(heard) < ECHOES or np.count_nonzero(~echo) < SILENT * len(readings):
+    if len(heard) < LEAST_ECHOES or np.count_nonzero(~echo) < LEAST_NO_ECHO * len(readings):
         return ''
     # a few random echoes may have any range
     part: NDArray[np.float64] = heard / readings.z_max[echo]
     farthest = float(np.quantile(part, 0.995))
-    if farthest > REACHED:
+    if farthest > REACHED_SHARE:
         return ''
     limit = float(np.median(readings.z_max))
     metres = farthest * limit
@@ -180,13 +180,13 @@ def _reach(readings: Readings) -> str:
     )
 
 
-def _scatter(readings: Readings) -> str:
+def _variance(readings: Readings) -> str:
     """Look for a variance by which ranges would say next to nothing."""
     stated = readings.echo & (readings.sigma > 0.0) & ~_of_fixed_distance(readings)
-    if np.count_nonzero(stated) < max(ENOUGH, 0.5 * np.count_nonzero(readings.echo)):
+    if np.count_nonzero(stated) < max(LEAST_READINGS, 0.5 * np.count_nonzero(readings.echo)):
         return ''
     sigma = float(np.median(readings.sigma[stated]))
-    if sigma < SCATTER:
+    if sigma < LARGEST_SIGMA:
         return ''
     return (
         f'the messages state a variance of {sigma * sigma:.3g} m², as if ranges scattered by {sigma:.2g} m: is it in '

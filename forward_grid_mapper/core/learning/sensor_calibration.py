@@ -23,19 +23,19 @@ from ..common.parameters import Parameters
 from ..common.readings import Floats, Readings
 from .trial_maps import BLOCKS, MountedReadings, TrialMap, coarse, trial_map
 
-MOST = 4000
+MOST_READINGS = 4000
 """Most readings of the maps from which a value is estimated."""
 
 LEAST_GAIN, SIGMAS = 30.0, 3.0
 """Least gain of J, nats, and least gain over the blocks, standard errors, for a value to be reported as wrong."""
 
-AS_GOOD = 0.8
+AS_GOOD_SHARE = 0.8
 """Part of the gain of the best quantity from which another may be the cause as well."""
 
-OF_STEP = 0.25
+GRID_ERROR_STEPS = 0.25
 """Standard error of the maximum on a map of cells, in steps."""
 
-MOVES = 12
+MOST_STEPS = 12
 """Most steps from the first guess."""
 
 
@@ -72,7 +72,7 @@ LEFT = Quantity((-0.15, 0.15), 0.05, lambda drive, value: drive.moved(left=value
 QUANTITIES = (TIME, YAW, FORWARD, LEFT)
 
 
-class Estimate(NamedTuple):
+class OffsetEstimate(NamedTuple):
     """A value that explains the readings better than zero.
 
     Attributes
@@ -98,7 +98,7 @@ class Estimate(NamedTuple):
     readings: int
     best: TrialMap
 
-    def gained_by(self, best: TrialMap, given: TrialMap) -> Estimate:
+    def gained_by(self, best: TrialMap, given: TrialMap) -> OffsetEstimate:
         """Return the estimate with the gain of one map, made with its value, over another, made without."""
         gain, sigmas = best.objective - given.objective, _sigmas(best.blocks - given.blocks)
         return self._replace(best=best, gain=gain, sigmas=sigmas)
@@ -109,7 +109,9 @@ class Estimate(NamedTuple):
         return self.gain >= LEAST_GAIN and self.sigmas >= SIGMAS and abs(self.value) >= SIGMAS * self.error
 
 
-def estimates(drive: MountedReadings, suspects: dict[Quantity, float], parameters: Parameters) -> list[Estimate]:
+def offset_estimates(
+    drive: MountedReadings, suspects: dict[Quantity, float], parameters: Parameters
+) -> list[OffsetEstimate]:
     """Return the significant estimates, that of the largest J first.
 
     Parameters
@@ -119,7 +121,7 @@ def estimates(drive: MountedReadings, suspects: dict[Quantity, float], parameter
         First guesses of the quantities that may be wrong.
     parameters : Parameters
     """
-    part = drive.moving_part(MOST)
+    part = drive.moving_part(MOST_READINGS)
     p = coarse(parameters, part.readings)
     given = trial_map(part.readings, p)
     found = [_estimate(part, quantity, guess, given, p) for quantity, guess in suspects.items()]
@@ -133,14 +135,14 @@ def estimates(drive: MountedReadings, suspects: dict[Quantity, float], parameter
     return sorted((each for each in wrong if each.significant), key=lambda each: -each.gain)
 
 
-def as_good(best: Estimate, other: Estimate) -> bool:
+def as_good(best: OffsetEstimate, other: OffsetEstimate) -> bool:
     """Return whether the drive hardly tells which of two quantities is wrong: at constant speed, late is behind."""
-    return other.gain >= AS_GOOD * best.gain or _sigmas(best.best.blocks - other.best.blocks) < SIGMAS - 1
+    return other.gain >= AS_GOOD_SHARE * best.gain or _sigmas(best.best.blocks - other.best.blocks) < SIGMAS - 1
 
 
 def _estimate(
     part: MountedReadings, quantity: Quantity, guess: float, given: TrialMap, parameters: Parameters
-) -> Estimate | None:
+) -> OffsetEstimate | None:
     """Climb from a guess to the maximum of J; None if there is none nearby."""
     step, tried = quantity.step, {0: given}
 
@@ -150,7 +152,7 @@ def _estimate(
         return tried[k]
 
     best = round(guess / step)
-    for _ in range(MOVES):
+    for _ in range(MOST_STEPS):
         top = max((best, best - 1, best + 1), key=lambda k: at(k).objective)
         if top == best:
             break
@@ -165,10 +167,10 @@ def _estimate(
     scores = (at(best + 1).blocks - at(best - 1).blocks) / 2
     error = math.sqrt(BLOCKS * float(np.var(scores, ddof=1))) / (-2 * a)
     found = at(best)
-    return Estimate(
+    return OffsetEstimate(
         quantity,
         (best + offset) * step,
-        math.hypot(error, OF_STEP) * step,
+        math.hypot(error, GRID_ERROR_STEPS) * step,
         found.objective - given.objective,
         _sigmas(found.blocks - given.blocks),
         len(part),

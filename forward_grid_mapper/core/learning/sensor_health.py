@@ -40,36 +40,36 @@ from ..sensor.forward_model import ForwardModel
 
 FRACTIONS = ('random', 'no_echo', 'missed', 'short')
 """Counts by sensor of which the table has the fractions."""
-NEAR = 0.5
+SHORT_WITHIN = 0.5
 """A random echo is short if it is nearer than this fraction of the distance to the first obstacle."""
-REACH = 0.75
+MISSED_WITHIN = 0.75
 """A max-range reading is missed if there is an obstacle within this fraction of max range."""
-FEW = 30
+LEAST_READINGS = 30
 """A sensor with fewer readings is not judged."""
-FEW_SHARE = 0.1
+LEAST_SHARE_OF_OTHERS = 0.1
 """Nor is one with less than this fraction of the median number of the others."""
-SILENT, DEAF = 0.95, 0.2
+DEAF_NO_ECHO, DEAF_MISSED = 0.95, 0.2
 """A sensor that detects nothing has at least these fractions of max-range readings and of missed obstacles."""
-PHANTOMS = 0.5
+DEAF_RANDOM_ECHOES = 0.5
 """At least this fraction of its few echoes is random."""
-SHORT = 0.5
-RANDOM = 0.5
-OFTEN = 0.3
+SUSPECT_SHORT = 0.5
+SUSPECT_RANDOM = 0.5
+SUSPECT_RANDOM_WITH_OTHERS = 0.3
 """A sensor with others to compare with is suspect from this fraction of random readings on: if its pose is wrong, the
 walls along which the robot drives still explain many."""
-SAME, WINDOW = 0.8, 0.2
+SUSPECT_SAME, WINDOW = 0.8, 0.2
 """A sensor that repeats one range has at least this fraction of its readings, or of its short readings, within this
 many metres: it may hear its robot only now and then."""
-CLOSE = 0.7
+PERSON_SHORT_SHARE = 0.7
 """If at least this fraction of the random readings is short, but not at one range, a person moves near the sensor."""
 BIN, BINS = 0.05, 400
 """Size, metres, and number of the bins of ranges, if readings are counted in portions."""
-PLACE = 0.1
+PLACE_SIZE = 0.1
 """Metres, and radians, from one place to the next. The fraction of the places with such readings must be as large,
 since whatever stands near a parked robot is no fault of its sensors."""
-ABOVE = 0.25
+ABOVE_MEDIAN = 0.25
 """A suspect fraction is at least this much above the median of the others."""
-FREE = 0.35
+FREE_PROBABILITY = 0.35
 """Cells of the live map of the others' echoes are free below this probability."""
 
 
@@ -162,34 +162,38 @@ def sensor_health(maps: MapSet) -> dict[str, SensorHealth]:
     """Return the table of all sensors, by name in the order of `Readings.sensor_names`."""
     readings = maps.readings
     obstacle = first_obstacles(maps.forward_model(), maps.ml)
-    marks = _marks(readings, obstacle, maps.unexplained)
+    marks = _readings_by_column(readings, obstacle, maps.unexplained)
     count = len(readings.sensor_names)
     numbers = np.bincount(readings.sensor, minlength=count)[:count]
     heard = [readings.z[readings.echo & (readings.sensor == k)] for k in range(count)]
     common = [commonest_range(z) for z in heard]
     usual_range = np.array([np.median(z) if len(z) else math.nan for z in heard])
     for k, (held, middle) in enumerate(common):
-        if held >= max(SAME * numbers[k], 1) and middle < NEAR * _median(np.delete(usual_range, k)):
+        if held >= max(SUSPECT_SAME * numbers[k], 1) and middle < SHORT_WITHIN * _median(np.delete(usual_range, k)):
             marks['short'] |= _from_free_space(maps, k)
     counts = {kind: np.bincount(readings.sensor, weights=mark, minlength=count)[:count] for kind, mark in marks.items()}
     near = [commonest_range(readings.z[marks['short'] & (readings.sensor == k)]) for k in range(count)]
-    return _table(readings.sensor_names, numbers, counts | _places(readings, marks), common, near)
+    return _table(readings.sensor_names, numbers, counts | _place_counts(readings, marks), common, near)
 
 
-def _marks(readings: Readings, obstacle: Floats, unexplained: NDArray[np.bool_]) -> dict[str, NDArray[np.bool_]]:
+def _readings_by_column(
+    readings: Readings, obstacle: Floats, unexplained: NDArray[np.bool_]
+) -> dict[str, NDArray[np.bool_]]:
     """Return which readings belong to each column of the table, shape (N,)."""
     echo = readings.echo
     return {
         'random': unexplained,
         'no_echo': ~echo,
-        'missed': ~echo & (obstacle < REACH * readings.z_max),
-        'short': echo & unexplained & (readings.z < NEAR * np.minimum(obstacle, readings.z_max)),
+        'missed': ~echo & (obstacle < MISSED_WITHIN * readings.z_max),
+        'short': echo & unexplained & (readings.z < SHORT_WITHIN * np.minimum(obstacle, readings.z_max)),
     }
 
 
-def _places(readings: Readings, marks: Mapping[str, NDArray[np.bool_]]) -> dict[str, NDArray[np.int64]]:
+def _place_counts(readings: Readings, marks: Mapping[str, NDArray[np.bool_]]) -> dict[str, NDArray[np.int64]]:
     """Return from how many places and directions each sensor has readings, random and short ones, shape (S,)."""
-    poses = np.column_stack([readings.sensor, *(np.floor(v / PLACE) for v in (readings.x, readings.y, readings.yaw))])
+    poses = np.column_stack(
+        [readings.sensor, *(np.floor(v / PLACE_SIZE) for v in (readings.x, readings.y, readings.yaw))]
+    )
     # sorted once, by columns, since np.unique takes seconds for a million rows
     order = np.lexsort(poses.T)
     poses = poses[order]
@@ -223,7 +227,7 @@ def _table(
         others = {kind: _median(np.delete(share, k)) for kind, share in shares.items()}
         usual = _median(np.delete(numbers, k).astype(np.float64))
         verdict = _verdict(int(numbers[k]), usual, mine, others)
-        middle = near[k][1] if mine['alike'] >= SAME else common[k][1]
+        middle = near[k][1] if mine['alike'] >= SUSPECT_SAME else common[k][1]
         columns = {kind: mine[kind] for kind in (*FRACTIONS, 'same', 'alike')}
         made[name] = SensorHealth(int(numbers[k]), **columns, common=middle, verdict=verdict)
     return made
@@ -241,9 +245,9 @@ def health_counts(
     `BIN` metres; the last bin has all longer ones.
     """
     size = len(readings.sensor_names)
-    marks = _marks(readings, first_obstacles(forward, ml), unexplained)
+    marks = _readings_by_column(readings, first_obstacles(forward, ml), unexplained)
     counts = {kind: np.bincount(readings.sensor[mark], minlength=size) for kind, mark in marks.items()}
-    counts |= _places(readings, marks)
+    counts |= _place_counts(readings, marks)
     counts['readings'] = np.bincount(readings.sensor, minlength=size)
     for kind, chosen in (('ranges', readings.echo), ('short_ranges', marks['short'])):
         counts[kind] = np.zeros((size, BINS), np.int64)
@@ -255,11 +259,15 @@ def health_counts(
 def health_of_counts(names: tuple[str, ...], counts: Mapping[str, NDArray[np.int64]]) -> dict[str, SensorHealth]:
     """Return the table from sums of `health_counts`: like `sensor_health`, but without the echoes of the others."""
     return _table(
-        names, counts['readings'], counts, _of_histograms(counts['ranges']), _of_histograms(counts['short_ranges'])
+        names,
+        counts['readings'],
+        counts,
+        _commonest_ranges(counts['ranges']),
+        _commonest_ranges(counts['short_ranges']),
     )
 
 
-def _of_histograms(rows: NDArray[np.int64]) -> list[tuple[int, float]]:
+def _commonest_ranges(rows: NDArray[np.int64]) -> list[tuple[int, float]]:
     """Return the `commonest_range` of each row, from a histogram of its ranges."""
     width = round(WINDOW / BIN)
     common = []
@@ -285,7 +293,7 @@ def _from_free_space(maps: MapSet, sensor: int) -> NDArray[np.bool_]:
     free = np.zeros(len(readings), bool)
     there = np.flatnonzero(mine)[inside]
     # NaN, where the others have no echoes, is not free
-    free[there] = probability[rows[inside], columns[inside]] < FREE
+    free[there] = probability[rows[inside], columns[inside]] < FREE_PROBABILITY
     return free
 
 
@@ -296,24 +304,28 @@ def _median(values: Floats) -> float:
 
 
 def _verdict(number: int, usual: float, mine: dict[str, float], others: dict[str, float]) -> str:
-    if number < FEW or number < FEW_SHARE * usual:
+    if number < LEAST_READINGS or number < LEAST_SHARE_OF_OTHERS * usual:
         return 'few readings'
 
     def above(kind: str) -> bool:
         # a single sensor has no others to compare with
-        return not math.isfinite(others[kind]) or mine[kind] >= others[kind] + ABOVE
+        return not math.isfinite(others[kind]) or mine[kind] >= others[kind] + ABOVE_MEDIAN
 
     # a robot may stand for hours in front of something that returns no echo, but then some echoes are explained
-    phantoms = mine['random'] >= PHANTOMS * (1.0 - mine['no_echo'])
-    if mine['no_echo'] >= SILENT and mine['missed'] >= DEAF and phantoms and above('no_echo'):
+    phantoms = mine['random'] >= DEAF_RANDOM_ECHOES * (1.0 - mine['no_echo'])
+    if mine['no_echo'] >= DEAF_NO_ECHO and mine['missed'] >= DEAF_MISSED and phantoms and above('no_echo'):
         return 'never hears anything'
-    repeats = max(mine['same'], mine['alike']) >= SAME
-    if min(mine['short'], mine['places_short']) >= SHORT and repeats and above('short'):
+    repeats = max(mine['same'], mine['alike']) >= SUSPECT_SAME
+    if min(mine['short'], mine['places_short']) >= SUSPECT_SHORT and repeats and above('short'):
         return 'always short'
-    often = min(mine['random'], mine['places_random']) >= OFTEN and math.isfinite(others['random']) and above('random')
-    if (often or mine['random'] >= RANDOM) and mine['short'] >= CLOSE * mine['random']:
+    often = (
+        min(mine['random'], mine['places_random']) >= SUSPECT_RANDOM_WITH_OTHERS
+        and math.isfinite(others['random'])
+        and above('random')
+    )
+    if (often or mine['random'] >= SUSPECT_RANDOM) and mine['short'] >= PERSON_SHORT_SHARE * mine['random']:
         return 'something moves near it'
-    if min(mine['random'], mine['places_random']) >= RANDOM and above('random'):
+    if min(mine['random'], mine['places_random']) >= SUSPECT_RANDOM and above('random'):
         return 'mostly random'
     return 'often random' if often else 'ok'
 

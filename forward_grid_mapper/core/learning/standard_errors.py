@@ -43,7 +43,7 @@ _NORMAL = 1.96
 
 
 @dataclass(frozen=True)
-class Estimate:
+class ParameterEstimate:
     """A learned value and its uncertainty.
 
     Attributes
@@ -89,7 +89,7 @@ def estimating_functions(forward: ForwardModel, occupied: NDArray[Any]) -> dict[
     return made
 
 
-def estimates(forward: ForwardModel, occupied: NDArray[Any]) -> dict[str, Estimate]:
+def parameter_estimates(forward: ForwardModel, occupied: NDArray[Any]) -> dict[str, ParameterEstimate]:
     """Return each learned value of the model with its standard error, given the map.
 
     Parameters
@@ -110,7 +110,7 @@ def estimates(forward: ForwardModel, occupied: NDArray[Any]) -> dict[str, Estima
         why = held[name]
         if not why and not math.isfinite(error):
             why = 'the readings do not determine it'
-        made[name] = Estimate(value, error, *_interval(name, value, error), informed[name], why)
+        made[name] = ParameterEstimate(value, error, *_interval(name, value, error), informed[name], why)
     return made
 
 

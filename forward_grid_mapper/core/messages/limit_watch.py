@@ -31,7 +31,7 @@ may be of several kinds, also without the one with the most such ranges; and of 
 SENTINEL = 0.5
 """If one value has this fraction of the ranges beyond, the driver sends it for 'no echo'."""
 
-FARTHEST = 100.0
+LONGEST_RANGE = 100.0
 """Metres; no sonar measures so far, and hardly any other Range sensor."""
 
 NEAR = 0.2
@@ -214,11 +214,11 @@ def _below(samples: Floats, sensor: NDArray[np.int64] | None) -> str:
 def _far(samples: Floats) -> str:
     ranges, _, limits = samples
     limit = _middle(limits)
-    if limit < FARTHEST:
+    if limit < LONGEST_RANGE:
         return ''
     # in a corridor most ranges are short
     large = _at(0.9, ranges)
-    if large > FARTHEST:
+    if large > LONGEST_RANGE:
         return (
             f'a tenth of the ranges is larger than {large:.0f} m, and max_range is {limit:.4g} m, farther than sonars '
             'can measure: are ranges and limits in centimetres or millimetres? Messages must state metres; correct '

@@ -17,7 +17,7 @@ from .message_batch import REASON
 from .message_types import Pose2
 from .rep117 import Measurement, Measurements
 
-FARTHEST = 2e7
+LARGEST_COORDINATE = 2e7
 """Largest possible coordinate, metres: half the circumference of the Earth."""
 
 LARGEST_CONE = 2_000_000
@@ -26,7 +26,7 @@ LARGEST_CONE = 2_000_000
 
 def possible(pose: Pose2) -> bool:
     """Return whether a pose is finite and on Earth; comparisons are false for NaN."""
-    return abs(pose.x) < FARTHEST and abs(pose.y) < FARTHEST and math.isfinite(pose.yaw)
+    return abs(pose.x) < LARGEST_COORDINATE and abs(pose.y) < LARGEST_COORDINATE and math.isfinite(pose.yaw)
 
 
 def reach_with_margin(measured: Measurement, parameters: Parameters) -> float:
@@ -124,7 +124,7 @@ class MapExtent:
     def _box_of_all(self, poses: Floats, half_angle: Floats, reach: Floats, parameters: Parameters) -> Box | None:
         """Return the box around all readings; None if one of them might not be admitted."""
         x, y, yaw = poses.T
-        if not ((np.abs(x) < FARTHEST) & (np.abs(y) < FARTHEST) & np.isfinite(yaw)).all():
+        if not ((np.abs(x) < LARGEST_COORDINATE) & (np.abs(y) < LARGEST_COORDINATE) & np.isfinite(yaw)).all():
             return None
         sides = np.stack([x - reach, -(x + reach), y - reach, -(y + reach)])
         mine = np.array(self._box) * _SIGNS[:, 0]

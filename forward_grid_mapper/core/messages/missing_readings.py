@@ -34,7 +34,7 @@ PERIODS = 3.5
 SLOWEST_SOUND = 300.0
 """Metres per second, less than on the coldest day."""
 
-FARTHEST = 20.0
+LONGEST_SONAR_RANGE = 20.0
 """Metres; no sonar waits for an echo from farther away, so a larger max_range is in another unit or not stated."""
 
 ENOUGH = 100
@@ -96,14 +96,14 @@ class MissingReadings:
         self._of: dict[str, _Intervals] = {}
         self._together = _Intervals()
         self._count = self._silent = 0
-        self._farthest = 0.0
+        self._largest_max_range = 0.0
 
     def add(self, message: RangeMessage) -> None:
         """Take a message."""
         self._count += 1
         self._silent += not 0.0 < message.range < message.max_range
-        if self._farthest < message.max_range < FARTHEST:
-            self._farthest = message.max_range
+        if self._largest_max_range < message.max_range < LONGEST_SONAR_RANGE:
+            self._largest_max_range = message.max_range
         self._together.add(message.stamp)
         if own := record_of(self._of, message.frame_id, _Intervals):
             own.add(message.stamp)
@@ -113,7 +113,9 @@ class MissingReadings:
         echo = (messages.range > 0.0) & (messages.range < messages.max_range)
         self._count += len(echo)
         self._silent += len(echo) - int(np.count_nonzero(echo))
-        self._farthest = float(messages.max_range[messages.max_range < FARTHEST].max(initial=self._farthest))
+        self._largest_max_range = float(
+            messages.max_range[messages.max_range < LONGEST_SONAR_RANGE].max(initial=self._largest_max_range)
+        )
         self._together.add_all(messages.stamp)
         for frame, part in messages.of_each():
             if own := record_of(self._of, frame, _Intervals):
@@ -124,7 +126,7 @@ class MissingReadings:
         if self._silent > NONE * self._count:
             return []
         missing = {}
-        waiting = len(self._of) * 2.0 * self._farthest / SLOWEST_SOUND * NANOSECONDS
+        waiting = len(self._of) * 2.0 * self._largest_max_range / SLOWEST_SOUND * NANOSECONDS
         for frame, own in self._of.items():
             if own.counts.sum() >= ENOUGH:
                 pause = max(PERIODS * own.period, own.period + waiting)

@@ -12,7 +12,7 @@ from .message_types import Pose2
 TURN = 2.0 * math.pi
 """Largest yaw of a sensor, radians; its float32 value is accepted, too."""
 
-FARTHEST = 10.0
+FARTHEST_MOUNT = 10.0
 """Largest distance of a sensor from the origin of the base frame, metres; 15 for 15 cm is more."""
 
 
@@ -41,10 +41,10 @@ def mount_from(name: str, values: object) -> Pose2:
             f'{name}: a yaw of {pose.yaw:g} is in radians, which is more than a full turn; {pose.yaw:g} degrees are '
             f'{math.radians(pose.yaw):.4f}'
         )
-    if math.hypot(pose.x, pose.y) > FARTHEST:
+    if math.hypot(pose.x, pose.y) > FARTHEST_MOUNT:
         raise ParameterError(
             f'{name}: the sensor would be {math.hypot(pose.x, pose.y):.3g} m away from the middle of the robot, more '
-            f'than {FARTHEST:g} m; x and y are in metres'
+            f'than {FARTHEST_MOUNT:g} m; x and y are in metres'
         )
     return pose
 
@@ -55,7 +55,7 @@ def far_mounts(poses: Mapping[str, Pose2]) -> list[str]:
     They are mapped nevertheless: the transforms of a crane may be right.
     """
     away = {frame: math.hypot(pose.x, pose.y) for frame, pose in poses.items()}
-    far = sorted(frame for frame, distance in away.items() if distance > FARTHEST)
+    far = sorted(frame for frame, distance in away.items() if distance > FARTHEST_MOUNT)
     if not far:
         return []
     return [

@@ -12,7 +12,14 @@ import pytest
 from forward_grid_mapper.core.common.parameters import Parameters
 from forward_grid_mapper.core.common.readings import Readings
 from forward_grid_mapper.core.learning import sensor_calibration
-from forward_grid_mapper.core.learning.sensor_calibration import FORWARD, LEFT, TIME, Estimate, as_good, estimates
+from forward_grid_mapper.core.learning.sensor_calibration import (
+    FORWARD,
+    LEFT,
+    TIME,
+    OffsetEstimate,
+    as_good,
+    offset_estimates,
+)
 from forward_grid_mapper.core.learning.trial_maps import BLOCKS, MountedReadings, TrialMap
 from forward_grid_mapper.core.messages.message_types import NANOSECONDS, Pose2
 
@@ -51,7 +58,7 @@ def explained(monkeypatch: pytest.MonkeyPatch) -> Callable[[Callable[[float, flo
 
 def test_maximum_is_found_between_the_steps(explained) -> None:
     explained(lambda x, y: 200 - 2e4 * (y - 0.117) ** 2)
-    (found,) = estimates(straight(), {LEFT: 0.15}, Parameters())
+    (found,) = offset_estimates(straight(), {LEFT: 0.15}, Parameters())
     assert found.quantity is LEFT
     assert found.value == pytest.approx(0.117, abs=1e-6)
     assert 0.01 < found.error < 0.03
@@ -63,29 +70,29 @@ def test_gain_of_moved_cells_is_no_offset(explained) -> None:
         return 100 * math.cos(math.pi * (y - 0.1) / 0.2) ** 2
 
     explained(of_borders)
-    assert estimates(straight(), {LEFT: 0.15}, Parameters()) == []
+    assert offset_estimates(straight(), {LEFT: 0.15}, Parameters()) == []
     # beside a true offset it does not matter
     explained(lambda x, y: of_borders(x, y) + 900 - 3e4 * (y - 0.15) ** 2)
-    (found,) = estimates(straight(), {LEFT: 0.15}, Parameters())
+    (found,) = offset_estimates(straight(), {LEFT: 0.15}, Parameters())
     assert found.value == pytest.approx(0.15, abs=0.03)
 
 
 def test_small_or_uncertain_gain_is_no_offset(explained, monkeypatch: pytest.MonkeyPatch) -> None:
     explained(lambda x, y: 25 - 2e4 * (y - 0.03) ** 2)
-    assert estimates(straight(), {LEFT: 0.05}, Parameters()) == []
+    assert offset_estimates(straight(), {LEFT: 0.05}, Parameters()) == []
     explained(lambda x, y: 200 - 2e4 * (y - 0.117) ** 2)
     monkeypatch.setattr('forward_grid_mapper.core.learning.sensor_calibration.SIGMAS', 1e9)
-    assert estimates(straight(), {LEFT: 0.15}, Parameters()) == []
+    assert offset_estimates(straight(), {LEFT: 0.15}, Parameters()) == []
 
 
 def test_search_without_a_maximum_ends(explained) -> None:
     explained(lambda x, y: 100 * y)
-    assert estimates(straight(), {LEFT: 0.15}, Parameters()) == []
+    assert offset_estimates(straight(), {LEFT: 0.15}, Parameters()) == []
 
 
 def test_late_is_as_good_as_behind_at_constant_speed(explained) -> None:
     explained(lambda x, y: 300 - 1e4 * (x - straight().readings.x.mean() + 0.2) ** 2)
-    found = estimates(straight(), {TIME: -0.15, FORWARD: -0.15}, Parameters())
+    found = offset_estimates(straight(), {TIME: -0.15, FORWARD: -0.15}, Parameters())
     assert {each.quantity for each in found} == {TIME, FORWARD}
     for each in found:
         # at 1 m/s; positions of the last readings of the part are not known after its end
@@ -95,8 +102,8 @@ def test_late_is_as_good_as_behind_at_constant_speed(explained) -> None:
 
 def test_clearly_worse_quantity_is_no_rival() -> None:
     nothing = np.zeros(BLOCKS)
-    best = Estimate(TIME, 0.2, 0.01, 500.0, 9.0, 4000, TrialMap(0.0, nothing + 12.5 + NOISE))
-    other = Estimate(FORWARD, 0.2, 0.01, 300.0, 6.0, 4000, TrialMap(0.0, nothing + 7.5))
+    best = OffsetEstimate(TIME, 0.2, 0.01, 500.0, 9.0, 4000, TrialMap(0.0, nothing + 12.5 + NOISE))
+    other = OffsetEstimate(FORWARD, 0.2, 0.01, 300.0, 6.0, 4000, TrialMap(0.0, nothing + 7.5))
     assert not as_good(best, other)
     assert as_good(best, other._replace(gain=450.0))
     assert as_good(best, other._replace(best=best.best))

@@ -17,10 +17,10 @@ from forward_grid_mapper.core.common.readings import Readings
 from forward_grid_mapper.core.learning.sensor_health import (
     BIN,
     BINS,
-    FEW,
-    FEW_SHARE,
+    LEAST_READINGS,
+    LEAST_SHARE_OF_OTHERS,
     WINDOW,
-    _of_histograms,
+    _commonest_ranges,
     commonest_range,
     first_obstacles,
     health_counts,
@@ -277,7 +277,7 @@ def test_most_frequent_range_from_counts_is_near_that_of_the_ranges(ranges: list
     """Bins lose the position within 5 cm: the count may be smaller, but the middle is that of a window with it."""
     z = np.array(ranges)
     row = np.bincount(np.minimum(z / BIN, BINS - 1).astype(np.int64), minlength=BINS)
-    ((count, middle),) = _of_histograms(row[None])
+    ((count, middle),) = _commonest_ranges(row[None])
     assert 1 <= count <= commonest_range(z)[0]
     assert count == np.count_nonzero(np.abs((np.floor(z / BIN) + 0.5) * BIN - middle) < WINDOW / 2)
 
@@ -287,6 +287,6 @@ def test_sensor_with_far_fewer_readings_than_the_others_has_no_verdict() -> None
     mine = np.flatnonzero(readings.sensor == 8)
     usual = np.count_nonzero(readings.sensor == 9)
     others = np.flatnonzero(readings.sensor != 8)
-    rare = readings.select(np.concatenate([np.repeat(others, 3), mine[: FEW + 1]]))
-    assert FEW < np.count_nonzero(rare.sensor == 8) < FEW_SHARE * 3 * usual
+    rare = readings.select(np.concatenate([np.repeat(others, 3), mine[: LEAST_READINGS + 1]]))
+    assert LEAST_READINGS < np.count_nonzero(rare.sensor == 8) < LEAST_SHARE_OF_OTHERS * 3 * usual
     assert sensor_health(mapped(rare))['sonar_08'].verdict == 'few readings'

@@ -12,15 +12,20 @@ from line_world import LINE, TRUTH, drawn, line_map
 from forward_grid_mapper.core.common.parameter_groups import ModelParameters
 from forward_grid_mapper.core.common.readings import Readings
 from forward_grid_mapper.core.joint_learning import settle
-from forward_grid_mapper.core.learning.standard_errors import LEARNED, Estimate, estimates, estimating_functions
+from forward_grid_mapper.core.learning.standard_errors import (
+    LEARNED,
+    ParameterEstimate,
+    estimating_functions,
+    parameter_estimates,
+)
 from forward_grid_mapper.core.sensor.forward_model import ForwardModel, expectations
 
 START = ModelParameters()
 
 
-def learned(readings: Readings, start: ModelParameters = START) -> dict[str, Estimate]:
+def learned(readings: Readings, start: ModelParameters = START) -> dict[str, ParameterEstimate]:
     forward = ForwardModel(readings, LINE, start)
-    return estimates(forward.at(settle(forward, line_map())), line_map())
+    return parameter_estimates(forward.at(settle(forward, line_map())), line_map())
 
 
 def test_intervals_contain_the_true_values_in_95_per_cent() -> None:
@@ -59,7 +64,7 @@ def test_estimating_functions_are_derivatives_of_the_log_likelihood(name: str) -
 def test_estimating_functions_vanish_at_the_learned_values() -> None:
     readings = drawn(np.random.default_rng(5), 2000)
     model = settle(ForwardModel(readings, LINE, START), line_map())
-    for name, found in estimates(ForwardModel(readings, LINE, model), line_map()).items():
+    for name, found in parameter_estimates(ForwardModel(readings, LINE, model), line_map()).items():
         actual = estimating_functions(ForwardModel(readings, LINE, model), line_map())[name]
         total, spread = actual.sum(), actual.std() * math.sqrt(len(readings))
         assert abs(total) < 0.1 * spread, (name, found)
@@ -98,7 +103,7 @@ def test_values_that_cannot_be_learned_have_a_reason() -> None:
     assert math.isnan(found['sigma'].error) and math.isfinite(found['p_hit'].error)
     silent = dataclasses.replace(readings, z=readings.z_max.copy())
     free = np.zeros(LINE.shape, np.int8)
-    nothing = estimates(ForwardModel(silent, LINE, START), free)
+    nothing = parameter_estimates(ForwardModel(silent, LINE, START), free)
     assert nothing['p_hit'].bound == nothing['sigma'].bound == 'no reading informs it'
     stated = dataclasses.replace(readings, sigma=np.full(len(readings), 0.05))
-    assert estimates(ForwardModel(stated, LINE, START), line_map())['sigma'].readings == 0
+    assert parameter_estimates(ForwardModel(stated, LINE, START), line_map())['sigma'].readings == 0

@@ -10,7 +10,7 @@ import pytest
 from forward_grid_mapper.core.common.constants import arc_depths
 from forward_grid_mapper.core.common.parameters import Parameters
 from forward_grid_mapper.core.common.readings import Readings
-from forward_grid_mapper.core.messages.map_extent import FARTHEST, LARGEST_CONE, MapExtent, reach_with_margin
+from forward_grid_mapper.core.messages.map_extent import LARGEST_CONE, LARGEST_COORDINATE, MapExtent, reach_with_margin
 from forward_grid_mapper.core.messages.message_types import Pose2, RangeMessage
 from forward_grid_mapper.core.messages.rep117 import Measurement, measure
 from forward_grid_mapper.core.sensor.density import CUT
@@ -148,7 +148,7 @@ def test_cone_at_the_limit_of_cells_is_accepted_and_above_is_not() -> None:
         assert MapExtent().admit(Pose2(0, 0, 0), one, wide) == expected
         restored = Readings.from_columns(x=0.0, y=0.0, yaw=0.0, z=[z - 0.6], z_max=1000.0, half_angle=1.0)
         assert MapExtent().restore(restored, wide)['large_cone'].tolist() == [bool(expected)]
-    assert FARTHEST == 2e7 and LARGEST_CONE == 2_000_000
+    assert LARGEST_COORDINATE == 2e7 and LARGEST_CONE == 2_000_000
 
 
 def test_restored_readings_have_their_own_sigma_or_that_of_the_model() -> None:

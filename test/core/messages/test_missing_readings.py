@@ -115,7 +115,7 @@ def test_batch_counts_as_single_messages(seed: int, sizes: list[int]) -> None:
             one.add(message)
         many.add_all(batch_of(list(enumerate(messages))).ranges)
     assert (one._count, one._silent, one._of.keys()) == (many._count, many._silent, many._of.keys())
-    assert one._farthest == many._farthest
+    assert one._largest_max_range == many._largest_max_range
     assert not one._of.keys() & {'', 'c\n'}
     for first, second in [(one._together, many._together), *((one._of[name], many._of[name]) for name in one._of)]:
         assert first._last == second._last

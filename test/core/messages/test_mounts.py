@@ -10,7 +10,7 @@ import pytest
 
 from forward_grid_mapper.core.common.errors import ParameterError
 from forward_grid_mapper.core.messages.message_types import Pose2
-from forward_grid_mapper.core.messages.mounts import FARTHEST, TURN, far_mounts, mount_from
+from forward_grid_mapper.core.messages.mounts import FARTHEST_MOUNT, TURN, far_mounts, mount_from
 
 
 @pytest.mark.parametrize('form', [list, tuple, np.array, lambda values: array.array('d', values)])
@@ -24,7 +24,7 @@ def test_pose_from_numpy_numbers(kind: type) -> None:
 
 
 def test_values_at_the_limits_are_accepted() -> None:
-    assert mount_from('left', [FARTHEST, 0, float(np.float32(-TURN))]).x == FARTHEST
+    assert mount_from('left', [FARTHEST_MOUNT, 0, float(np.float32(-TURN))]).x == FARTHEST_MOUNT
 
 
 @pytest.mark.parametrize(
@@ -46,7 +46,7 @@ def test_bad_pose_is_rejected_with_reason(values: object, message: str) -> None:
 
 
 def test_warning_names_far_sensors_and_the_largest_distance() -> None:
-    near = Pose2(FARTHEST, 0.0, 0.0)
+    near = Pose2(FARTHEST_MOUNT, 0.0, 0.0)
     assert far_mounts({}) == far_mounts({'left': near}) == []
     (warning,) = far_mounts({'left': near, 'back': Pose2(-150.0, 0.0, 0.0), 'front': Pose2(0.0, 170.0, 0.0)})
     assert 'put back, front up to 170 m away' in warning and 'millimetres' in warning and 'left' not in warning
