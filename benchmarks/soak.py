@@ -133,7 +133,7 @@ class Soak:
             measured.clear()
         gc.collect()
         return (
-            f'{len(buffer):10d}{buffer.held:9d}{seconds / 3600:8.2f}{resident():9.0f}{typical:10.1f}{worst:10.1f}'
+            f'{len(buffer):10d}{buffer.stored:9d}{seconds / 3600:8.2f}{resident():9.0f}{typical:10.1f}{worst:10.1f}'
             f'{update:10.2f}{live:10.2f}'
         )
 

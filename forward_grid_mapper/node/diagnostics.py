@@ -81,11 +81,11 @@ class Health:
         """
         level, message = self._judge(associator, intake, map_frame, absent)
         bound = associator.parameters.max_readings
-        held = min(associator.buffer.held, bound or associator.buffer.held)
+        kept = min(associator.buffer.stored, bound or associator.buffer.stored)
         values = {
             'readings received': intake.received,
             'readings accepted': len(associator.buffer),
-            'readings kept to map from': f'{held} of at most {bound}' if bound else held,
+            'readings kept to map from': f'{kept} of at most {bound}' if bound else kept,
             'readings waiting for a pose': intake.waiting,
             'readings rejected': sum(associator.rejected.values()),
             'readings lost in the middleware (estimated)': intake.lost,

@@ -285,7 +285,7 @@ class MapperNode(ManagedNode):
     def _step_done(self, what: str) -> None:
         """Begin to map once the earlier readings are restored; log it once the live map has its kernels as well."""
         if what == 'journal':
-            self.associator.buffer.aside = self._thin_in_background
+            self.associator.buffer.run_in_background = self._thin_in_background
             self.journal.begin(self._steady)
             self.create_timer(FEED_PERIOD, self.feed.feed, clock=self._steady)
             self.intake.begin()

@@ -53,7 +53,7 @@ def late(messages: list[Any], rng: random.Random) -> list[Any]:
 def of_the_node(messages: list[Any], parameters: Parameters, rng: random.Random) -> tuple[Readings, LiveSnapshot, int]:
     associator = PoseAssociator(lookup, parameters, at_once=rng.choice((1, 7, 200)))
     aside: list[Any] = []
-    associator.buffer.aside = lambda thin, done: aside.append((thin, done))
+    associator.buffer.run_in_background = lambda thin, done: aside.append((thin, done))
     live, fed = LiveMap(parameters, lambda snapshot: None, print), 0
 
     def feed() -> None:

@@ -410,7 +410,7 @@ def test_readings_restored_after_a_clean_up_do_not_reach_new_parts(inside: Calla
     assert node.trigger_cleanup() == TransitionCallbackReturn.SUCCESS
     # before thinning, readings are given to the maps
     assert before.restore(some_readings(30)) == 0
-    assert before.buffer.held < len(before.buffer) == 30
+    assert before.buffer.stored < len(before.buffer) == 30
 
 
 def test_failed_configuration_releases_the_journal(

@@ -80,7 +80,7 @@ def test_executor_does_no_long_work(inside: Callable[..., Inside], watched: list
         watched.clear()
         robot.until(lambda node=node: node.mapping)
         robot.drive(len(node.associator.buffer), 1000)
-        robot.until(lambda node=node: node.associator.buffer.held < 460)
+        robot.until(lambda node=node: node.associator.buffer.stored < 460)
         robot.until(lambda node=node: node.maps.latest['ml_map'].info.width)
         assert robot.call(node.em.run_em)[0]
         assert robot.call(node.saver.save_maps)[0]
@@ -504,10 +504,10 @@ def test_thinning_without_memory_is_retried(inside: Callable[..., Inside], monke
     monkeypatch.setattr(reading_buffer, 'kept', fail)
     robot.drive(0, 91)
     robot.until(lambda: any(worker.trouble for worker in robot.node.workers))
-    robot.until(lambda: not robot.node.associator.buffer._thinning)
+    robot.until(lambda: not robot.node.associator.buffer._is_thinning)
     monkeypatch.setattr(reading_buffer, 'kept', original)
     robot.drive(91, 40)
-    robot.until(lambda: robot.node.associator.buffer.held < 100)
+    robot.until(lambda: robot.node.associator.buffer.stored < 100)
     assert len(robot.node.associator.buffer) == 131
     assert robot.status('background')['level'] == OK
 
@@ -533,9 +533,9 @@ def test_buffer_of_the_node_is_thinned_in_the_background(inside: Callable[..., I
     """The live map still contains all readings."""
     robot = inside(max_readings=100).start()
     node = robot.node
-    assert isinstance(node.associator.buffer, ReadingBuffer) and node.associator.buffer.aside is not None
+    assert isinstance(node.associator.buffer, ReadingBuffer) and node.associator.buffer.run_in_background is not None
     robot.drive(0, 400)
-    robot.until(lambda: node.associator.buffer.held < 120)
+    robot.until(lambda: node.associator.buffer.stored < 120)
     everything = LogOddsMap(node.parameters)
     lone = inside(max_readings=0).start()
     lone.drive(0, 400)

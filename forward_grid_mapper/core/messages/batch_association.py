@@ -74,7 +74,7 @@ class BatchAssociator(PoseAssociator):
     def add_batch(self, batch: MessageBatch) -> None:
         """Take messages in the order in which they were recorded."""
         if self._is_usual(batch.odometry):
-            self._add_at_once(batch)
+            self._add_in_order(batch)
             return
         for message in batch.one_by_one():
             if isinstance(message, RangeMessage):
@@ -97,7 +97,7 @@ class BatchAssociator(PoseAssociator):
         in_order = bool((np.diff(odometry.stamp) > 0).all()) and (newest is None or odometry.stamp[0] > newest)
         return in_order and all(possible(Pose2(*pose)) for pose in odometry.pose.tolist())
 
-    def _add_at_once(self, batch: MessageBatch) -> None:
+    def _add_in_order(self, batch: MessageBatch) -> None:
         """Process a batch with usual odometry."""
         ranges, odometry = batch
         newest = self._history.newest
@@ -120,7 +120,7 @@ class BatchAssociator(PoseAssociator):
         self._wait(waiting.select(~settled), frames)
         waiting, placed = waiting.select(settled), placed[settled]
         order = np.lexsort((waiting.number, waiting.stamp, placed))
-        why = self._keep(waiting.select(order), frames)
+        why = self._place_all(waiting.select(order), frames)
         # count rejections in the same order as message by message; reports list them so
         bad = ~good
         places = np.concatenate([ranges.place[bad], placed[order]])
@@ -142,8 +142,8 @@ class BatchAssociator(PoseAssociator):
     def _with_earlier(self, new: _Waiting, frames: list[str]) -> _Waiting:
         """Return the new readings, and those of earlier batches that can be settled now."""
         newest, earlier = self._history.newest, []
-        while newest is not None and self._waiting and self._waiting[0].stamp <= newest - JUMP:
-            earlier.append(heapq.heappop(self._waiting))
+        while newest is not None and self._without_pose and self._without_pose[0].stamp <= newest - JUMP:
+            earlier.append(heapq.heappop(self._without_pose))
         if not earlier:
             return new
         names = {name: k for k, name in enumerate(frames)}
@@ -163,9 +163,9 @@ class BatchAssociator(PoseAssociator):
             message = RangeMessage(stamp, frames[frame], z, 0.0, z_max, 2 * half_angle)
             held = Measurement(message, z, z_max, half_angle, sigma)
             held.number = number
-            heapq.heappush(self._waiting, held)
+            heapq.heappush(self._without_pose, held)
 
-    def _keep(self, waiting: _Waiting, frames: list[str]) -> NDArray[np.str_]:
+    def _place_all(self, waiting: _Waiting, frames: list[str]) -> NDArray[np.str_]:
         """Place readings in order, and store those that are accepted; return the reasons for rejection, or ''."""
         poses = self._history.at_all(waiting.stamp, self.parameters.max_pose_gap)
         measured = Measurements(poses.reason, *waiting[4:])
@@ -185,7 +185,7 @@ class BatchAssociator(PoseAssociator):
                         column[part] = values
                 sensors[part] = _composed(poses, part, mount)
         kept = np.flatnonzero(measured.reason == '')
-        measured.reason[kept] = self._extent.admit_all(sensors[kept], measured.select(kept), self._all)
+        measured.reason[kept] = self._extent.admit_all(sensors[kept], measured.select(kept), self._all_parameters)
         kept = np.flatnonzero(measured.reason == '')
         self._append(waiting.select(kept), sensors[kept], measured.select(kept), frames)
         return measured.reason

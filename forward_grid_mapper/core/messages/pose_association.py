@@ -11,6 +11,7 @@ import sys
 import time
 from collections import Counter, deque
 from collections.abc import Callable
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -37,6 +38,16 @@ MOST_WAITING = 100_000
 
 LONGEST_LAG = 60.0
 """Longest time that a reading waits for odometry that keeps coming but has not reached its stamp, seconds."""
+
+
+class _Deadline(NamedTuple):
+    """A reading waited too long if both its stamp, nanoseconds, and its arrival by the clock, seconds, are earlier."""
+
+    stamp: int
+    arrival: float
+
+    def is_over(self, measured: Measurement) -> bool:
+        return measured.stamp < self.stamp and measured.arrival < self.arrival
 
 
 class PoseAssociator(MessageAccount):
@@ -90,29 +101,33 @@ class PoseAssociator(MessageAccount):
         self._clock = clock
         self._extrinsics = extrinsics
         self.parameters = (parameters or Parameters()).association
-        self._all = parameters or Parameters()
+        self._all_parameters = parameters or Parameters()
         self._extent = MapExtent()
         self._patient = patient
         self.buffer = ReadingBuffer(self.parameters.max_readings)
         self.limits, self.missing = LimitWatch(), MissingReadings()
         self.map_frame = self.base_frame = ''
-        self._waiting: list[Measurement] = []
+        # readings that wait for odometry, a heap by stamp
+        self._without_pose: list[Measurement] = []
         self._path, self._history = RobotPath(), PoseHistory(patient)
         self.record = self._history.record
         self._newest_range: int | None = None
         self._restored_until: int | None = None
-        self._held: deque[tuple[Measurement, Pose2, Later]] = deque()
-        self._retrying = 0
-        self._next_try = self._next_look = 0
+        # readings with the pose of the robot, which wait for that of their sensor on it
+        self._without_extrinsics: deque[tuple[Measurement, Pose2, Later]] = deque()
+        # look-ups that remain in the present pass over them
+        self._lookups_left = 0
+        # in message time, nanoseconds
+        self._next_lookup = self._next_future_check = 0
         self._at_once = at_once or sys.maxsize
-        self._odometry_arrival = self._odometry_sent = self._next_try_by_clock = 0.0
+        self._odometry_arrival = self._odometry_sent = self._next_lookup_by_clock = 0.0
         self.behind = self._other_frame = False
         self.settled = 0
 
     @property
     def waiting(self) -> int:
         """Number of readings that wait for odometry, or for the pose of their sensor on the robot."""
-        return len(self._waiting) + len(self._held)
+        return len(self._without_pose) + len(self._without_extrinsics)
 
     @property
     def odometry_stamp(self) -> int | None:
@@ -137,7 +152,7 @@ class PoseAssociator(MessageAccount):
 
     def change(self, parameters: Parameters) -> None:
         """Use other parameters from here on; those of the grid and of the buffer must be the same."""
-        self.parameters, self._all = parameters.association, parameters
+        self.parameters, self._all_parameters = parameters.association, parameters
 
     @property
     def odometry(self) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
@@ -163,7 +178,7 @@ class PoseAssociator(MessageAccount):
             self._reject(message.frame_id, 'too_many_waiting')
             return
         measured.number, measured.arrival, measured.sent = self.received, self._clock(), sent
-        heapq.heappush(self._waiting, measured)
+        heapq.heappush(self._without_pose, measured)
         self._newest_range = max(measured.stamp, self._newest_range or measured.stamp)
         self._settle()
 
@@ -172,7 +187,7 @@ class PoseAssociator(MessageAccount):
 
         `parameters` are those of the new maps.
         """
-        self._all = parameters or self._all
+        self._all_parameters = parameters or self._all_parameters
         if self._other_frame:
             self.map_frame = self.base_frame = ''
             self._history.clear()
@@ -181,10 +196,10 @@ class PoseAssociator(MessageAccount):
         self.limits.clear()
         self.missing.clear()
         self.begin_account()
-        self._waiting.clear()
-        self._held.clear()
-        self._retrying, self.behind = 0, False
-        self._newest_range, self._next_try, self._next_look = None, 0, 0
+        self._without_pose.clear()
+        self._without_extrinsics.clear()
+        self._lookups_left, self.behind = 0, False
+        self._newest_range, self._next_lookup, self._next_future_check = None, 0, 0
         self._restored_until = None
         self._path.clear()
         self._extent.clear()
@@ -214,9 +229,9 @@ class PoseAssociator(MessageAccount):
         self.extend_path(message.pose[:2])
         order = order_of(message.stamp, self._history.newest, self._history.before)
         if order == WAS_AHEAD:
-            self._drop_ahead()
+            self._drop_stamp_ahead()
         elif order == JUMPED_BACK:
-            self._jump_back()
+            self._begin_after_jump_back()
         elif self._history.newest is None and self._restored_until is not None:
             # the clock of an earlier run may have been ahead, as that of a simulation which began again
             self.time_jumps += message.stamp < self._restored_until - JUMP
@@ -235,12 +250,12 @@ class PoseAssociator(MessageAccount):
         newest = self._history.newest
         if newest is not None:
             self._settle_up_to(newest)
-        for measured in sorted(self._waiting):
+        for measured in sorted(self._without_pose):
             self._reject(measured.frame_id, 'no_odometry' if newest is None else 'after_odometry')
-        self._waiting.clear()
-        for measured, _, why in self._held:
+        self._without_pose.clear()
+        for measured, _, why in self._without_extrinsics:
             self._reject_unplaced(measured.frame_id, why.reason)
-        self._held.clear()
+        self._without_extrinsics.clear()
 
     def restore(self, readings: Readings) -> int:
         """Add readings that an earlier run accepted; those that the map cannot contain are rejected.
@@ -251,7 +266,7 @@ class PoseAssociator(MessageAccount):
             Number of rejected readings.
         """
         self.received += len(readings)
-        rejected = self._extent.restore(readings, self._all)
+        rejected = self._extent.restore(readings, self._all_parameters)
         admitted = np.ones(len(readings), bool)
         for reason, mask in rejected.items():
             if count := int(np.count_nonzero(mask)):
@@ -267,25 +282,26 @@ class PoseAssociator(MessageAccount):
         """Add a point to the path of the robot, if it is far enough from the last one."""
         self._path.extend(point)
 
-    def _drop_ahead(self) -> None:
+    def _drop_stamp_ahead(self) -> None:
         """Drop the newest pose, whose stamp was ahead of those before and after it; readings placed by it stay."""
         self._history.drop_newest()
         self.odometry_rejected['ahead_of_others'] += 1
         # time is that of the remaining stamps
-        self._next_try = self._next_look = 0
+        self._next_lookup = self._next_future_check = 0
 
-    def _jump_back(self) -> None:
+    def _begin_after_jump_back(self) -> None:
+        """Place what can be placed, reject the other readings that wait, and forget poses, whose stamps are ahead."""
         assert self._history.newest is not None
         self._settle_up_to(self._history.newest)
         self.time_jumps += 1
         for frame_id, count in Counter(
-            m.frame_id for m in (*self._waiting, *(held for held, _, _ in self._held))
+            m.frame_id for m in (*self._without_pose, *(measured for measured, _, _ in self._without_extrinsics))
         ).items():
             self._reject(frame_id, 'time_jump', count)
-        self._waiting.clear()
-        self._held.clear()
-        self._retrying, self.behind = 0, False
-        self._next_try = self._next_look = 0
+        self._without_pose.clear()
+        self._without_extrinsics.clear()
+        self._lookups_left, self.behind = 0, False
+        self._next_lookup = self._next_future_check = 0
         self._history.clear()
         self._newest_range = None
 
@@ -311,33 +327,45 @@ class PoseAssociator(MessageAccount):
         times = self.parameters
         patience = max(times.pose_timeout, times.max_pose_gap) + max(times.range_time_offset, 0.0)
         limit = now - round(patience * NANOSECONDS)
-        if newest is not None and self._waiting and newest >= self._next_look:
-            self._next_look = newest + NANOSECONDS
-            self._drop_the_future(newest, patience)
-        if not ((self._waiting and self._waiting[0].stamp < limit) or self._held):
+        if newest is not None and self._without_pose and newest >= self._next_future_check:
+            self._next_future_check = newest + NANOSECONDS
+            self._reject_from_the_future(newest, patience)
+        if not ((self._without_pose and self._without_pose[0].stamp < limit) or self._without_extrinsics):
             return left
         clock = self._clock()
-        oldest = clock - patience
-        # odometry whose stamps increase is only late; otherwise `_drop_the_future` rejects the readings
-        waiting = self._waiting if newest is None or self._odometry_arrival < oldest else []
-        while left and waiting and waiting[0].stamp < limit and waiting[0].arrival < oldest:
-            self._reject(heapq.heappop(waiting).frame_id, 'no_odometry')
-            left -= 1
+        deadline = _Deadline(limit, clock - patience)
+        # odometry whose stamps increase is only late; otherwise `_reject_from_the_future` rejects the readings
+        if newest is None or self._odometry_arrival < deadline.arrival:
+            left = self._reject_without_pose(deadline, left)
         # a stamp from the future must not end it
-        if self._held and (now >= self._next_try or clock >= self._next_try_by_clock):
-            self._next_try, self._next_try_by_clock = now + RETRY, clock + RETRY / NANOSECONDS
-            self._retrying = len(self._held)
-        while left and self._retrying:
-            self._retrying -= 1
+        if self._without_extrinsics and (now >= self._next_lookup or clock >= self._next_lookup_by_clock):
+            self._next_lookup, self._next_lookup_by_clock = now + RETRY, clock + RETRY / NANOSECONDS
+            self._lookups_left = len(self._without_extrinsics)
+        return self._look_up_again(deadline, left)
+
+    def _reject_without_pose(self, deadline: _Deadline, left: int) -> int:
+        """Reject overdue readings that wait for odometry, at most `left`; return what remains of it."""
+        while left and self._without_pose and deadline.is_over(self._without_pose[0]):
+            self._reject(heapq.heappop(self._without_pose).frame_id, 'no_odometry')
             left -= 1
-            measured, pose, why = self._held.popleft()
-            if measured.stamp < limit and measured.arrival < oldest:
+        return left
+
+    def _look_up_again(self, deadline: _Deadline, left: int) -> int:
+        """Reject overdue readings that wait for the pose of their sensor, and look up that of the others again.
+
+        At most `left` readings; return what remains of it.
+        """
+        while left and self._lookups_left:
+            self._lookups_left -= 1
+            left -= 1
+            measured, pose, why = self._without_extrinsics.popleft()
+            if deadline.is_over(measured):
                 self._reject_unplaced(measured.frame_id, why.reason)
             else:
                 self._add_extrinsics(measured, pose)
         return left
 
-    def _drop_the_future(self, newest: int, patience: float) -> None:
+    def _reject_from_the_future(self, newest: int, patience: float) -> None:
         """Reject readings whose stamps odometry should have reached by now, by its own stamps and by the clock.
 
         Odometry that was published before a reading, and was overtaken by it, does not show that the clock is wrong.
@@ -345,7 +373,7 @@ class PoseAssociator(MessageAccount):
         clock = self._clock()
         oldest, published = clock - patience, self._odometry_sent and self._odometry_sent - patience * NANOSECONDS
         stay = []
-        for measured in self._waiting:
+        for measured in self._without_pose:
             if measured.newest is None:
                 measured.newest = newest
             overtook = measured.sent > published > 0 and measured.arrival > clock - LONGEST_LAG
@@ -353,20 +381,21 @@ class PoseAssociator(MessageAccount):
                 self._reject(measured.frame_id, 'from_the_future')
             else:
                 stay.append(measured)
-        if len(stay) < len(self._waiting):
-            self._waiting = stay
-            heapq.heapify(self._waiting)
+        if len(stay) < len(self._without_pose):
+            self._without_pose = stay
+            heapq.heapify(self._without_pose)
             # time is that of the remaining stamps
-            self._newest_range, self._next_try = max((measured.stamp for measured in stay), default=None), 0
+            self._newest_range, self._next_lookup = max((measured.stamp for measured in stay), default=None), 0
 
     def _settle_up_to(self, stamp: int, left: int = sys.maxsize) -> int:
         """Place the readings up to a stamp, at most `left`; return what remains of `left`."""
-        while left and self._waiting and self._waiting[0].stamp <= stamp:
-            self._place(heapq.heappop(self._waiting))
+        while left and self._without_pose and self._without_pose[0].stamp <= stamp:
+            self._place(heapq.heappop(self._without_pose))
             left -= 1
         return left
 
     def _place(self, measured: Measurement) -> None:
+        """Store a reading at its pose by odometry, or reject it."""
         pose = self._history.at(measured.stamp, self.parameters.max_pose_gap)
         if isinstance(pose, str):
             self._reject(measured.frame_id, pose)
@@ -379,7 +408,7 @@ class PoseAssociator(MessageAccount):
         if isinstance(extrinsic, Later):
             if extrinsic.reason != 'unknown_extrinsics':
                 self.unknown_frames.discard(measured.frame_id)
-            self._held.append((measured, pose, extrinsic))
+            self._without_extrinsics.append((measured, pose, extrinsic))
             return
         if extrinsic is None:
             self._reject_unplaced(measured.frame_id, 'unknown_extrinsics')
@@ -390,7 +419,7 @@ class PoseAssociator(MessageAccount):
             return
         sensor = pose.compose(extrinsic)
         reason = project(measured, extrinsic.elevation) if isinstance(extrinsic, Mount) else ''
-        reason = reason or self._extent.admit(sensor, measured, self._all)
+        reason = reason or self._extent.admit(sensor, measured, self._all_parameters)
         if reason:
             self._reject(measured.frame_id, reason)
             return

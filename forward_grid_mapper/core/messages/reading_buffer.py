@@ -32,10 +32,18 @@ class _Thinned(NamedTuple):
     version: int
 
 
+_InBackground = Callable[[Callable[[], _Thinned], Callable[[_Thinned | None], None]], None]
+
+
 class ReadingBuffer:
     """Columns that grow with the readings, and are thinned (`thinning`) if there are more than `bound`.
 
-    It needs 76 bytes for each reading. One thread appends; any may take snapshots.
+    It needs 76 bytes for each reading. One thread appends; any may take snapshots, which are views of the columns. So
+    stored rows never change: columns that are full, or thinned, are replaced by others.
+
+    While large columns fill up, their rows are copied to `_next_columns` in steps: `_copied` of them so far. While
+    `_is_thinning`, other columns are being made, perhaps in another thread; they are of no use if `_version` has
+    changed meanwhile. After a failure, thinning begins again once there are more readings than `_size_at_failure`.
 
     Attributes
     ----------
@@ -43,7 +51,7 @@ class ReadingBuffer:
         Most readings that `bounded` returns; up to an eighth more are stored. 0 is no bound.
     before_thinning : list of callable
         Called before readings are dropped, by the thread that appends: the last chance to process new ones.
-    aside : callable, optional
+    run_in_background : callable, optional
         Takes two functions. It calls the first in another thread, and the second, with the result, in the thread that
         appends; with None if the first failed. By default, `append` blocks during thinning.
     """
@@ -59,9 +67,9 @@ class ReadingBuffer:
     def __init__(self, bound: int = 0) -> None:
         self.bound = bound
         self.before_thinning: list[Callable[[], None]] = []
-        self.aside: Callable[[Callable[[], _Thinned], Callable[[_Thinned | None], None]], None] | None = None
+        self.run_in_background: _InBackground | None = None
         self._version = 0
-        self._larger: Columns | None = None
+        self._next_columns: Columns | None = None
         # locked while columns are replaced, so that a snapshot never mixes old and new ones
         self._lock = threading.Lock()
         self.clear()
@@ -71,16 +79,16 @@ class ReadingBuffer:
         return self._count
 
     @property
-    def held(self) -> int:
+    def stored(self) -> int:
         """Number of readings in memory."""
         return self._size
 
     @property
     def room(self) -> int:
         """Number of readings up to and including the one that starts the next thinning; large without bound."""
-        if not self.bound or self._thinning:
+        if not self.bound or self._is_thinning:
             return sys.maxsize
-        return max(max(self.bound, self._failed_at) + self.bound // 8 + 1 - self._size, 1)
+        return max(max(self.bound, self._size_at_failure) + self.bound // 8 + 1 - self._size, 1)
 
     def clear(self) -> None:
         """Remove all readings and sensor names."""
@@ -91,7 +99,7 @@ class ReadingBuffer:
         self._first, self._last = sys.maxsize, -sys.maxsize
         self._counts: list[int] = []
         self._silent: list[int] = []
-        self._begin_anew()
+        self._discard_pending()
 
     def append(self, sensor: str, **values: float) -> None:
         """Add one reading of the sensor named `sensor`; `values` are the other columns of `Readings`."""
@@ -107,7 +115,7 @@ class ReadingBuffer:
         self._size += 1
         self._count += 1
         if not self._size % STEP:
-            self._move_on()
+            self._copy_ahead()
         self._thin()
 
     def extend(self, readings: Readings) -> None:
@@ -167,50 +175,52 @@ class ReadingBuffer:
         return bounded(self.snapshot(), self.bound)
 
     def _reserve(self, count: int) -> None:
+        """Make room for `count` more readings."""
         size = len(self._columns['z'])
         while size < self._size + count:
             size *= 2
         if size > len(self._columns['z']):
-            if self._larger is None or len(self._larger['z']) < size:
-                self._larger, self._moved = _empty(self._columns, size), 0
-            self._move(self._size)
+            if self._next_columns is None or len(self._next_columns['z']) < size:
+                self._next_columns, self._copied = _empty(self._columns, size), 0
+            self._copy_up_to(self._size)
             with self._lock:
-                self._columns = self._larger
-            self._larger = None
+                self._columns = self._next_columns
+            self._next_columns = None
 
-    def _move_on(self) -> None:
+    def _copy_ahead(self) -> None:
         """Copy some rows to larger columns if these are needed soon; once every `STEP` readings is enough."""
         size = len(self._columns['z'])
         if size < LARGE or self._size <= size - size // 4:
             return
-        if self._larger is None:
-            self._larger, self._moved = _empty(self._columns, 2 * size), 0
-        self._move(min(self._moved + 5 * STEP, self._size))
+        if self._next_columns is None:
+            self._next_columns, self._copied = _empty(self._columns, 2 * size), 0
+        self._copy_up_to(min(self._copied + 5 * STEP, self._size))
 
-    def _move(self, end: int) -> None:
-        assert self._larger is not None
+    def _copy_up_to(self, end: int) -> None:
+        assert self._next_columns is not None
         for name, column in self._columns.items():
-            self._larger[name][self._moved : end] = column[self._moved : end]
-        self._moved = end
+            self._next_columns[name][self._copied : end] = column[self._copied : end]
+        self._copied = end
 
-    def _begin_anew(self) -> None:
-        """Discard results for columns that are no longer those of the buffer."""
+    def _discard_pending(self) -> None:
+        """Discard a begun copy and a begun thinning, since they are of columns that are no longer the buffer's."""
         self._version += 1
-        self._larger, self._moved = None, 0
-        self._thinning, self._failed_at = False, 0
+        self._next_columns, self._copied = None, 0
+        self._is_thinning, self._size_at_failure = False, 0
 
     def _thin(self) -> None:
+        """Begin to thin if there are too many readings."""
         # not for each reading beyond the bound: thinning once for many costs the same
         slack = self.bound // 8
-        if not self.bound or self._thinning or self._size <= max(self.bound, self._failed_at) + slack:
+        if not self.bound or self._is_thinning or self._size <= max(self.bound, self._size_at_failure) + slack:
             return
-        self._thinning = True
+        self._is_thinning = True
         columns, size, version, names = self._columns, self._size, self._version, tuple(self._names)
 
         def thin() -> _Thinned:
             views = {name: column[:size] for name, column in columns.items()}
-            held = Readings(**{name: view for name, view in views.items() if name != 'number'}, sensor_names=names)
-            stay = kept(held, self.bound)
+            readings = Readings(**{name: view for name, view in views.items() if name != 'number'}, sensor_names=names)
+            stay = kept(readings, self.bound)
             # snapshots are views of the old columns, which therefore must not change
             thinned = _empty(columns, len(columns['z']))
             for name, view in views.items():
@@ -218,29 +228,30 @@ class ReadingBuffer:
                 np.take(view, stay, out=thinned[name][: len(stay)], mode='clip')
             return _Thinned(thinned, len(stay), size, version)
 
-        if self.aside is None:
-            self._take_thinned(thin())
+        if self.run_in_background is None:
+            self._use_thinned(thin())
         else:
-            self.aside(thin, self._take_thinned)
+            self.run_in_background(thin, self._use_thinned)
 
-    def _take_thinned(self, thinned: _Thinned | None) -> None:
+    def _use_thinned(self, thinned: _Thinned | None) -> None:
         """Replace the columns by thinned ones and what was appended since; without them, try again later."""
         if thinned is None:
-            self._thinning, self._failed_at = False, self._size
+            self._is_thinning, self._size_at_failure = False, self._size
             return
         if thinned.version != self._version:
             return
         try:
-            self._go_on_with(thinned)
+            self._replace_columns(thinned)
         except MemoryError:
-            self._thinning, self._failed_at = False, self._size
+            self._is_thinning, self._size_at_failure = False, self._size
             raise
         # so many readings may have come meanwhile that thinning is due again
         self._thin()
 
-    def _go_on_with(self, thinned: _Thinned) -> None:
-        for look in self.before_thinning:
-            look()
+    def _replace_columns(self, thinned: _Thinned) -> None:
+        """Continue with thinned columns, and the rows that were appended since."""
+        for callback in self.before_thinning:
+            callback()
         columns, tail = thinned.columns, slice(thinned.size, self._size)
         size = thinned.stay + self._size - thinned.size
         if size > len(columns['z']):
@@ -249,7 +260,7 @@ class ReadingBuffer:
             columns[name][thinned.stay : size] = column[tail]
         with self._lock:
             self._columns, self._size = columns, size
-        self._begin_anew()
+        self._discard_pending()
 
 
 def bounded(readings: Readings, bound: int) -> Readings:

@@ -125,7 +125,7 @@ def state_of(made: PoseAssociator) -> dict[str, Any]:
         'waiting': made.waiting,
         'path': made.path,
         'counts': list(made.buffer.counts().items()),
-        'held': made.buffer.held,
+        'held': made.buffer.stored,
         'warnings': made.message_warnings(),
     }
 

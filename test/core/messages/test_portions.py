@@ -114,15 +114,15 @@ def append(buffer: ReadingBuffer, first: int, count: int) -> None:
 def test_columns_grow_in_small_copies(monkeypatch: pytest.MonkeyPatch, restored: int) -> None:
     monkeypatch.setattr(reading_buffer, 'LARGE', 4096)
     moved: list[int] = []
-    move = ReadingBuffer._move
+    copy = ReadingBuffer._copy_up_to
 
     def counted(self: ReadingBuffer, end: int) -> None:
-        before = self._moved
-        move(self, end)
+        before = self._copied
+        copy(self, end)
         if len(self._columns['z']) >= 4096:
             moved.append(end - before)
 
-    monkeypatch.setattr(ReadingBuffer, '_move', counted)
+    monkeypatch.setattr(ReadingBuffer, '_copy_up_to', counted)
     buffer, earlier = ReadingBuffer(), ReadingBuffer()
     append(earlier, 0, restored)
     buffer.extend(earlier.snapshot())
@@ -138,7 +138,7 @@ def test_thinning_in_the_background_loses_no_readings() -> None:
     bound = 200
     aside: list[tuple[Callable[[], Any], Callable[[Any], None]]] = []
     ours, waiting = ReadingBuffer(bound), ReadingBuffer(bound)
-    ours.aside = lambda thin, done: aside.append((thin, done))
+    ours.run_in_background = lambda thin, done: aside.append((thin, done))
     looked: list[int] = []
     ours.before_thinning.append(lambda: looked.append(len(ours)))
     for first in range(0, 3000, 100):
@@ -151,7 +151,7 @@ def test_thinning_in_the_background_loses_no_readings() -> None:
             append(waiting, 10_000 + first, 7)
             done(thinned)
             assert looked[-1] == len(ours)
-            assert ours.held < 10 * bound
+            assert ours.stored < 10 * bound
     assert not aside or len(aside) == 1
     assert len(ours) == len(waiting)
     assert np.array_equal(ours.bounded().x, waiting.bounded().x)
@@ -160,11 +160,11 @@ def test_thinning_in_the_background_loses_no_readings() -> None:
 def test_thinning_that_fails_or_ends_after_a_reset_changes_nothing() -> None:
     aside: list[tuple[Callable[[], Any], Callable[[Any], None]]] = []
     buffer = ReadingBuffer(100)
-    buffer.aside = lambda thin, done: aside.append((thin, done))
+    buffer.run_in_background = lambda thin, done: aside.append((thin, done))
     append(buffer, 0, 113)
     _, done = aside.pop()
     done(None)
-    assert buffer.held == 113
+    assert buffer.stored == 113
     append(buffer, 113, 12)
     assert not aside
     append(buffer, 125, 1)

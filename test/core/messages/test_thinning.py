@@ -64,7 +64,7 @@ def test_kept_readings_do_not_depend_on_order_or_time_of_thinning(
     for order in (np.arange(count), rng.permutation(count)):
         buffer = appended(readings, bound, order)
         assert len(buffer) == count
-        assert buffer.held <= bound + bound // 8
+        assert buffer.stored <= bound + bound // 8
         assert rows(buffer.bounded()) == expected
 
 
@@ -115,7 +115,7 @@ def test_each_reading_is_seen_before_thinning() -> None:
 def test_thinning_without_memory_is_done_later() -> None:
     readings = made(np.random.default_rng(3), 1000)
     buffer, waiting = ReadingBuffer(64), list[Callable[[], None]]()
-    buffer.aside = lambda thin, done: waiting.append(lambda: done(thin()))
+    buffer.run_in_background = lambda thin, done: waiting.append(lambda: done(thin()))
     full = [True]
 
     def look() -> None:
@@ -127,10 +127,10 @@ def test_thinning_without_memory_is_done_later() -> None:
     buffer.extend(readings.select(slice(0, 100)))
     with pytest.raises(MemoryError):
         waiting.pop()()
-    assert buffer.held == 100 and not waiting
+    assert buffer.stored == 100 and not waiting
     buffer.extend(readings.select(slice(100, 200)))
     waiting.pop()()
-    assert buffer.held <= 64 and len(buffer) == 200
+    assert buffer.stored <= 64 and len(buffer) == 200
 
 
 def test_snapshots_from_another_thread_are_consistent() -> None:
@@ -156,4 +156,4 @@ def test_snapshots_from_another_thread_are_consistent() -> None:
     thread.join(60.0)
     assert not wrong
     buffer.clear()
-    assert (len(buffer), buffer.held, len(buffer.snapshot(7))) == (0, 0, 0)
+    assert (len(buffer), buffer.stored, len(buffer.snapshot(7))) == (0, 0, 0)
