@@ -21,11 +21,12 @@ from measuring import PATIENCE, machine, stream_seconds, timed
 from forward_grid_mapper.core.common.constants import arc_depths
 from forward_grid_mapper.core.common.parameters import Parameters
 from forward_grid_mapper.core.common.readings import Readings, in_canonical_order
+from forward_grid_mapper.core.evidence.cell_flip import find_observing, flip
 from forward_grid_mapper.core.evidence.evidence import Evidence
 from forward_grid_mapper.core.evidence.pairs import WORDS_PER_RUN, make
 from forward_grid_mapper.core.evidence.state import State
 from forward_grid_mapper.core.evidence.tile_index import CHUNK, SHIFT
-from forward_grid_mapper.core.evidence.updates import _add_to_free_zone, evaluate, find_observing, flip
+from forward_grid_mapper.core.evidence.updates import _add_to_free_zone, evaluate
 from forward_grid_mapper.core.maps.traversed import traversed_cells
 from forward_grid_mapper.core.search.flips import promising
 from forward_grid_mapper.core.search.prior import wall_prior

@@ -24,7 +24,8 @@ OURS: tuple[tuple[Any, str], ...] = (
     *((module, name) for module in (evidence, indexed_readings) for name in ('no_tiles', 'empty_maps')),
     *((indexed_readings, name) for name in ('more_chunks', 'empty_pairs', 'workspace_for')),
     *((learned_normals, name) for name in ('normals_of', 'renewed')),
-    *((evidence.Evidence, name) for name in ('_reserve', '_make_room', '_insert', 'grow', 'extend', 'renew_normals')),
+    *((evidence.Evidence, name) for name in ('_allocate_readings', '_allocate_pairs', '_insert')),
+    *((evidence.Evidence, name) for name in ('grow', 'extend', 'renew_normals')),
     *((online_map, name) for name in ('map_grid', 'grid_of', 'wall_prior', 'mark_traversed', 'Evidence', 'Search')),
     *((search, name) for name in ('log_prior', 'best_shifts', 'independent_prior', 'wall_prior')),
 )

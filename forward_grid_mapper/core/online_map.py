@@ -57,7 +57,7 @@ much, and refining is fast."""
 REFINE_LEAST = 50
 """Fewest new readings for it."""
 
-MANY = 5000
+SEARCH_ALL_FROM = 5000
 """With more new readings, a search of the whole map is faster."""
 
 
@@ -72,7 +72,7 @@ Key = bytes
 """The discretised values of a reading; the garbage collector does not traverse bytes."""
 
 
-class _Numbers(MutableMapping[Key, int]):
+class _IndexByKey(MutableMapping[Key, int]):
     """Indices of the stored readings, by key."""
 
     def __init__(self) -> None:
@@ -105,7 +105,7 @@ class _Numbers(MutableMapping[Key, int]):
             part.clear()
 
 
-OF_THE_ROBOT = 1000
+MOST_SIZE_READINGS = 1000
 """Readings from which the distances of the sensors on the robot are estimated (`traversed.longest_step`)."""
 
 NO_READINGS = Readings.from_columns(x=[], y=[], yaw=[], z=[], z_max=[], half_angle=[])
@@ -132,13 +132,15 @@ class OnlineMap:
     def clear(self) -> None:
         """Make the map empty."""
         self._evidence: Evidence | None = None
-        self._kept = _Numbers()
+        self._index_by_key = _IndexByKey()
         self._traversed = np.zeros((0, 0), np.bool_)
-        self._since: Window | None = None
-        self._count = 0
+        # the part that has changed since the last refinement
+        self._not_refined: Window | None = None
+        self._new_readings = 0
         self._prior = wall_prior(self._parameters.search, np.zeros(0, np.bool_), self._parameters.grid.resolution)
-        self._last = np.zeros(0), np.zeros(0), np.zeros(0, np.int64)
-        self._begun, self._longest = NO_READINGS, LONGEST_STEP
+        self._last_poses = np.zeros(0), np.zeros(0), np.zeros(0, np.int64)
+        # the first readings, from which the size of the robot follows
+        self._size_readings, self._longest_step = NO_READINGS, LONGEST_STEP
         self.grid = Grid(self._parameters.grid.resolution, 0, 0, 0, 0)
         self.taken = 0
         """Number of readings added, including those merged with equal ones."""
@@ -150,7 +152,7 @@ class OnlineMap:
     def dismantle(self) -> None:
         """Free the memory of a map that is not needed any more, in small steps: at once would hold the GIL for long."""
         self._evidence = None
-        self._kept.clear()
+        self._index_by_key.clear()
 
     def __len__(self) -> int:
         """Return the number of stored readings."""
@@ -159,7 +161,7 @@ class OnlineMap:
     @property
     def waiting(self) -> int:
         """Number of readings added since the last refinement."""
-        return self._count
+        return self._new_readings
 
     def add(self, readings: Readings) -> None:
         """Add readings and update the map.
@@ -183,14 +185,14 @@ class OnlineMap:
         traversed = self._newly_traversed(readings, evidence.grid)
         before = len(evidence)
         self._insert(evidence, readings)
-        self.grid, self.taken, self._count = grid, self.taken + len(readings), self._count + len(readings)
-        self._since = united(self._since, window)
+        self.grid, self.taken, self._new_readings = grid, self.taken + len(readings), self._new_readings + len(readings)
+        self._not_refined = united(self._not_refined, window)
         self._traversed[traversed.near] = traversed.cells
         self._prior.local.reshape(evidence.grid.shape)[traversed.near][traversed.cells] = -FORBIDDEN
-        self._last, self._begun, self._longest = traversed[2:]
-        if len(evidence) - before > MANY:
+        self._last_poses, self._size_readings, self._longest_step = traversed[2:]
+        if len(evidence) - before > SEARCH_ALL_FROM:
             self._search(evidence)
-        elif self._count >= min(REFINE_EVERY, max(REFINE_LEAST, REFINE_SHARE * len(evidence))):
+        elif self._new_readings >= min(REFINE_EVERY, max(REFINE_LEAST, REFINE_SHARE * len(evidence))):
             self._settle(evidence, window)
             self._refine(evidence)
         else:
@@ -206,10 +208,10 @@ class OnlineMap:
                 fresh.append([])
                 numbers = []
                 for key in self._keys(readings.select(slice(begin, begin + PORTION))):
-                    numbers.append(self._kept.get(key, -1))
+                    numbers.append(self._index_by_key.get(key, -1))
                     if numbers[-1] < 0:
                         fresh[-1].append(key)
-                        self._kept[key] = len(self._kept)
+                        self._index_by_key[key] = len(self._index_by_key)
                 number = np.array(numbers, np.int64)
                 new.append(begin + np.flatnonzero(number < 0))
                 known.append(number[number >= 0])
@@ -217,7 +219,7 @@ class OnlineMap:
         except BaseException:
             for keys in fresh:
                 for key in keys:
-                    self._kept.pop(key, None)
+                    self._index_by_key.pop(key, None)
             raise
 
     def _keys(self, readings: Readings) -> list[Key]:
@@ -245,13 +247,13 @@ class OnlineMap:
         """Search the whole map like a batch."""
         evidence.renew_normals()
         Search(evidence, self._parameters.search, self._traversed.ravel()).run()
-        self._since, self._count = None, 0
+        self._not_refined, self._new_readings = None, 0
 
     def _refine(self, evidence: Evidence) -> None:
         """Renew the surface normals, and search around all changes since the last time, with all moves."""
-        self._since = united(self._since, evidence.renew_normals())
-        Search(evidence, self._parameters.search, self._traversed.ravel(), self._since).refine()
-        self._since, self._count = None, 0
+        self._not_refined = united(self._not_refined, evidence.renew_normals())
+        Search(evidence, self._parameters.search, self._traversed.ravel(), self._not_refined).refine()
+        self._not_refined, self._new_readings = None, 0
 
     def adopt(self, grid: Grid, searched: NDArray[np.int8]) -> None:
         """Replace the map by another one of the same readings.
@@ -275,7 +277,7 @@ class OnlineMap:
     def _newly_traversed(self, readings: Readings, grid: Grid) -> _Traversed:
         """Return the cells that the robot traversed since the last reading; nothing is changed yet."""
         x, y, stamp = (
-            np.r_[old, new] for old, new in zip(self._last, (readings.x, readings.y, readings.stamp), strict=True)
+            np.r_[old, new] for old, new in zip(self._last_poses, (readings.x, readings.y, readings.stamp), strict=True)
         )
         rows, columns = grid.cells_of(x, y)
         # the last reading may be from before a jump, and outside of this grid
@@ -284,12 +286,12 @@ class OnlineMap:
         near = (slice(bottom, int(rows.max()) + 1), slice(left, int(columns.max()) + 1))
         cells = self._traversed[near].copy()
         part = Grid(grid.resolution, grid.column + left, grid.row + bottom, cells.shape[1], cells.shape[0])
-        begun, longest = self._begun, self._longest
-        if len(begun) < OF_THE_ROBOT:
+        begun, longest = self._size_readings, self._longest_step
+        if len(begun) < MOST_SIZE_READINGS:
             begun = of_drives([begun, readings])
             longest = longest_step(begun)
             # later only their number matters, and there may be half a million
-            begun = begun.select(np.arange(min(len(begun), OF_THE_ROBOT)))
+            begun = begun.select(np.arange(min(len(begun), MOST_SIZE_READINGS)))
         mark_traversed(x, y, stamp, part, cells, longest)
         n = STRIDES[-1]
         return _Traversed(near, cells, (x[-n:], y[-n:], stamp[-n:]), begun, longest)
@@ -316,10 +318,10 @@ class OnlineMap:
             evidence = Evidence(larger, p.model, memory_for_pairs(p), threads, self._stop, renewable=True)
         else:
             evidence.grow(larger)
-            if self._since:
+            if self._not_refined:
                 up, right = inner[0].start, inner[1].start
-                a, b, c, d = self._since
-                self._since = a + up, b + up, c + right, d + right
+                a, b, c, d = self._not_refined
+                self._not_refined = a + up, b + up, c + right, d + right
         self._evidence, self._traversed, self._prior = evidence, traversed, prior
         return evidence
 

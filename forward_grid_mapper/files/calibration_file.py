@@ -9,7 +9,7 @@ from pathlib import Path
 import yaml
 
 from ..core.common.errors import ParameterError
-from ..core.common.parameter import LARGEST
+from ..core.common.parameter import LARGEST_NUMBER
 from ..core.trajectory.certainty import Estimate
 from .small_text import read_text
 
@@ -78,7 +78,7 @@ def load_calibration(path: Path | str) -> dict[str, float]:
             raise ParameterError(f'{path}: {key!r} is not one of {", ".join(names)}')
         name = names[key]
         # an integer may be too large for a float; NaN fails the comparison
-        if isinstance(value, bool) or not isinstance(value, (int, float)) or not abs(value) < LARGEST:
+        if isinstance(value, bool) or not isinstance(value, (int, float)) or not abs(value) < LARGEST_NUMBER:
             raise ParameterError(f'{path}: {key} is {value!r}, not a finite number')
         figure = value - 1.0 if key.endswith('factor') else math.radians(value)
         if abs(figure) > MOST[name]:

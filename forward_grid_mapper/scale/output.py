@@ -1,6 +1,6 @@
 """The results of a job: the usual files if the map is small enough, otherwise files in parts.
 
-Beyond `LARGEST` cells no file contains the whole map:
+Beyond `MOST_CELLS_OF_A_FILE` cells no file contains the whole map:
 
 maps.zarr       live_map, ml_map, uncertainty_map and dynamic in chunks; 0 is the full resolution, and each further
                 level has half as many cells a side, the largest of four, down to `OVERVIEW`
@@ -40,7 +40,7 @@ from .job import Job, plan_of, task
 from .mapping import Found, Say
 from .work_folder import outcome_in, read_arrays
 
-LARGEST = 16_000_000
+MOST_CELLS_OF_A_FILE = 16_000_000
 """Most cells of maps in one file: 4000 x 4000, which is 400 m with cells of 0.1 m."""
 
 REGION = 1024
@@ -74,7 +74,7 @@ def write_output(
         If a file cannot be written.
     """
     grid = found.tiling.grid
-    large = grid.size > LARGEST
+    large = grid.size > MOST_CELLS_OF_A_FILE
     if large:
         layers, step = _write_parts(folder, job, found, cluster, say)
     else:

@@ -93,7 +93,7 @@ def test_growing_grid_keeps_the_state(monkeypatch: pytest.MonkeyPatch) -> None:
     online = in_sweeps(near, Parameters().varied({'p_rand': 0.3, 'p_lost': 0.4}))
     grid, before = online.maps()[:2]
     room = online._evidence.grid
-    traversed, since = online._traversed.copy(), online._since
+    traversed, since = online._traversed.copy(), online._not_refined
     online.add(away)
     larger, ml = online.maps()[:2]
     assert online._evidence.grid.size > room.size
@@ -104,7 +104,7 @@ def test_growing_grid_keeps_the_state(monkeypatch: pytest.MonkeyPatch) -> None:
     rows, columns = online._evidence.grid.window(room)
     assert online._traversed[rows, columns][traversed].all()
     moved = since[0] + rows.start, since[1] + rows.start, since[2] + columns.start, since[3] + columns.start
-    assert online._since == united(moved, online._around(online._evidence, away)), 'what is to be refined'
+    assert online._not_refined == united(moved, online._around(online._evidence, away)), 'what is to be refined'
     assert consistent(online)
     again = in_sweeps(near, Parameters())
     assert again._evidence.grid == room
@@ -129,11 +129,11 @@ def test_repeated_readings_only_add_weight(values: dict[str, float]) -> None:
     assert weight.sum() == 8 * len(readings)
     # as if each kept reading had come this number of times
     often = Evidence(evidence.grid, evidence.model, start=evidence.state.maps.occupied.reshape(evidence.grid.shape))
-    kept = np.array(sorted(set(online._kept.values())))
+    kept = np.array(sorted(set(online._index_by_key.values())))
     assert kept.tolist() == list(range(count))
     first: dict[int, int] = {}
     for i, key in enumerate(keys_of(online, readings)):
-        first.setdefault(online._kept[key], i)
+        first.setdefault(online._index_by_key[key], i)
     often.extend(readings.select(np.repeat([first[k] for k in range(count)], weight)))
     for name in ('evidence', 'seen', 'pattern'):
         assert np.array_equal(getattr(often.state.maps, name), getattr(evidence.state.maps, name))
@@ -186,10 +186,10 @@ def test_numbers_of_readings_do_not_depend_on_portions(monkeypatch: pytest.Monke
     numbers: dict[bytes, int] = {}
     for key in keys_of(online, readings):
         numbers.setdefault(key, len(numbers))
-    assert dict(online._kept) == dict(expected._kept) == numbers
+    assert dict(online._index_by_key) == dict(expected._index_by_key) == numbers
     assert state_of(online).same(state_of(expected))
     online.dismantle()
-    assert len(online._kept) == 0 == len(list(online._kept))
+    assert len(online._index_by_key) == 0 == len(list(online._index_by_key))
 
 
 def test_keys_ignore_the_sign_of_zero() -> None:
@@ -283,8 +283,8 @@ def test_sweep_of_a_driver_that_knows_no_largest_range_examines_only_its_surroun
 def test_many_readings_at_once_are_not_stored_twice() -> None:
     online = OnlineMap(Parameters())
     online.add(some(count=3000))
-    assert len(online._begun) == online_map.OF_THE_ROBOT
-    assert online._begun.x.base is None
+    assert len(online._size_readings) == online_map.MOST_SIZE_READINGS
+    assert online._size_readings.x.base is None
 
 
 def test_cells_below_a_large_robot_are_free() -> None:
@@ -353,7 +353,7 @@ def test_reading_too_far_away_is_rejected_and_changes_nothing() -> None:
 
 
 def test_many_readings_at_once_give_the_map_of_a_batch(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(online_map, 'MANY', 100)
+    monkeypatch.setattr(online_map, 'SEARCH_ALL_FROM', 100)
     values = {**PLAIN, 'resolution': 0.1}
     readings = some(count=140)
     online = OnlineMap(Parameters().varied(values))
@@ -369,14 +369,14 @@ def test_many_readings_at_once_give_the_map_of_a_batch(monkeypatch: pytest.Monke
 def test_map_is_searched_again_at_intervals(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(online_map, 'REFINE_EVERY', 50)
     often = in_sweeps(some(), Parameters())
-    assert often._count == 150 - 2 * 72
+    assert often._new_readings == 150 - 2 * 72
     # only what changed since is searched the next time
-    assert often._since == often._around(often._evidence, some().select(slice(144, 150)))
+    assert often._not_refined == often._around(often._evidence, some().select(slice(144, 150)))
     assert consistent(often)
     for name in ('REFINE_EVERY', 'REFINE_LEAST'):
         monkeypatch.setattr(online_map, name, math.inf)
     never = in_sweeps(some(), Parameters())
-    assert never._count == 150
+    assert never._new_readings == 150
     heights = [online._evidence.log_likelihood for online in (often, never)]
     assert heights[0] != heights[1]
 
@@ -424,14 +424,15 @@ def state_of(online: OnlineMap) -> State:
     arrays += [s.reading_states[name][:n].copy() for name in ('multiplicity', 'occupy', 'release', 'likelihood')]
     if len(s.normals.known):
         arrays.append(s.normals.known.reshape(evidence.grid.shape)[window].copy())
-    return State([*arrays, online._traversed[window].copy()], dict(online._kept), (online.taken, online._count))
+    counts = online.taken, online._new_readings
+    return State([*arrays, online._traversed[window].copy()], dict(online._index_by_key), counts)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize('case', ['first', 'more', 'grown', 'refined', 'many'])
 def test_call_without_memory_adds_no_readings_or_all(monkeypatch: pytest.MonkeyPatch, case: str) -> None:
     monkeypatch.setattr(online_map, 'REFINE_LEAST', 60)
-    monkeypatch.setattr(online_map, 'MANY', 50 if case == 'many' else 5000)
+    monkeypatch.setattr(online_map, 'SEARCH_ALL_FROM', 50 if case == 'many' else 5000)
     monkeypatch.setattr(threads, 'LEAST_PART', 20)
     # every third reading repeats an earlier one
     readings = some(3, 100)
@@ -465,7 +466,7 @@ def test_call_without_memory_adds_no_readings_or_all(monkeypatch: pytest.MonkeyP
         if online._evidence is not None:
             assert consistent(online)
             assert online._evidence.state.reading_states['multiplicity'][: len(online)].sum() == online.taken
-        assert len(online._kept) == len(online)
+        assert len(online._index_by_key) == len(online)
         assert online.taken in (taken, taken + len(parts[at]))
         accepted = online.taken > taken
         if not accepted:
@@ -496,9 +497,9 @@ def test_readings_that_could_not_be_added_are_not_known(monkeypatch: pytest.Monk
     with monkeypatch.context() as patched, pytest.raises(MemoryError):
         patched.setattr(Evidence, 'extend', without_memory)
         online.add(readings.select(slice(50, 100)))
-    assert (len(online._kept), online.taken) == (len(online), 50)
+    assert (len(online._index_by_key), online.taken) == (len(online), 50)
     online.add(readings.select(slice(50, 100)))
-    assert (len(online._kept), online.taken) == (len(online), 100)
+    assert (len(online._index_by_key), online.taken) == (len(online), 100)
     assert consistent(online)
 
 
@@ -556,7 +557,7 @@ def test_normals_are_those_of_all_readings_at_once() -> None:
     kept = Evidence(evidence.grid, evidence.model, start=evidence.state.maps.occupied.reshape(evidence.grid.shape))
     first: dict[int, int] = {}
     for i, key in enumerate(keys_of(online, readings)):
-        first.setdefault(online._kept[key], i)
+        first.setdefault(online._index_by_key[key], i)
     times = evidence.state.reading_states['multiplicity'][: len(online)]
     kept.extend(readings.select(np.repeat([first[k] for k in range(len(online))], times)))
     for name in ('known', 'x', 'y', 'before'):

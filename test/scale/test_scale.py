@@ -202,7 +202,7 @@ def test_large_maps_are_written_in_parts(
 
     from forward_grid_mapper.scale import output
 
-    for name, value in (('LARGEST', 0), ('REGION', 64), ('OVERVIEW', 60)):
+    for name, value in (('MOST_CELLS_OF_A_FILE', 0), ('REGION', 64), ('OVERVIEW', 60)):
         monkeypatch.setattr(output, name, value)
     folder = made_here(drives, tmp_path, Here())
     maps = read_npz(one_process / 'maps.npz')

@@ -11,7 +11,7 @@ import numpy as np
 
 from .errors import ParameterError
 
-LARGEST = 1 << 1000
+LARGEST_NUMBER = 1 << 1000
 """Beyond all bounds of parameters, and still a float."""
 
 
@@ -107,7 +107,7 @@ class Parameter:
             value = tuple(value)
         if self.type is float and isinstance(value, int) and not isinstance(value, bool):
             # the largest whole numbers are no floats
-            value = float(min(max(value, -LARGEST), LARGEST))
+            value = float(min(max(value, -LARGEST_NUMBER), LARGEST_NUMBER))
         if type(value) is not self.type:
             raise ParameterError(f'{self.name}: {value!r} is not {wanted}; admitted: {self.range} {self.unit}'.rstrip())
         if self.choices and value not in self.choices:

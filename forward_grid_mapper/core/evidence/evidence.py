@@ -1,4 +1,8 @@
-"""The evidence of each cell, given readings and a map; updated incrementally by new readings and by flips."""
+"""The evidence of each cell, given readings and a map; updated incrementally by new readings and by flips.
+
+The class has two halves. `IndexedReadings`, its base, holds the cones, the index and the memory. `Evidence` evaluates
+the readings on the map, and estimates the surface normals.
+"""
 
 from __future__ import annotations
 
@@ -16,7 +20,7 @@ from ..sensor.cone_table import cone_table
 from ..sensor.surface_normals import SurfaceNormals, no_normals, on_larger_grid, touched
 from .fixed_point import QUANTUM
 from .indexed_readings import IndexedReadings, empty_maps
-from .indexing import LARGEST, UNUSED, WORDS, reading_state_table
+from .indexing import ALLOCATED_WORDS, LARGEST_CONE, UNUSED_WORDS, reading_state_table
 from .learned_normals import first_normals, has_limit, keep_bearings, renewed_normals
 from .neighbourhood import note_flips, set_patterns
 from .pairs import WORDS_PER_BAND_PAIR
@@ -73,8 +77,10 @@ class Evidence(IndexedReadings):
             Of the cells of `grid`, if known beforehand; then the grid cannot grow.
         """
         learns = has_limit(model)
-        self._sums = np.zeros((3, grid.size), np.int64) if learns and renewable else None
-        self._since: Window | None = None
+        # of `surface_normals.gather`, if normals are renewable
+        self._bearing_sums = np.zeros((3, grid.size), np.int64) if learns and renewable else None
+        # contains the cones of all readings since the last renewal of the normals
+        self._not_renewed: Window | None = None
         self._given_normals = normals is not None
         stop = np.zeros(1, np.uint8) if stop is None else stop
         occupied = np.zeros(grid.shape, np.uint8) if start is None else np.array(start, np.uint8)
@@ -140,13 +146,13 @@ class Evidence(IndexedReadings):
         reading_states = reading_state_table(
             readings, cones['sigma'] * self.grid.resolution, self.model, self.grid.resolution
         )
-        self._reserve(end)
+        self._allocate_readings(end)
         s = self.state
         s.cones[begin:end], s.reading_states[begin:end] = cones, reading_states
         # the bearings of the first readings are added before their pairs are made
         later = s.cones[begin:end] if begin else s.cones[:0], s.cones[again]
-        since = united(self._since, *(box_of(cones, self.grid) for cones in later))
-        before = self._index_so_far()
+        since = united(self._not_renewed, *(box_of(cones, self.grid) for cones in later))
+        before = self._index_state()
         try:
             if not begin and not self._given_normals and has_limit(self.model):
                 self._learn_normals(end)
@@ -156,28 +162,28 @@ class Evidence(IndexedReadings):
                 if len(again):
                     add_multiplicity(self.state, again)
             except BaseException:
-                self._evaluate_again(begin)
+                self._evaluate_from_scratch(begin)
                 raise
         except BaseException:
-            self._take_out(begin, before)
-            if not begin and self._sums is not None:
-                self._sums[:] = 0
+            self._restore_index(begin, before)
+            if not begin and self._bearing_sums is not None:
+                self._bearing_sums[:] = 0
             raise
         self._size = end
-        if self._sums is not None:
+        if self._bearing_sums is not None:
             for cones in later:
-                keep_bearings(cones, self.grid, self._sums)
-            self._since = since
+                keep_bearings(cones, self.grid, self._bearing_sums)
+            self._not_renewed = since
 
     def add_multiplicity(self, readings: NDArray[np.int64]) -> None:
         """Increase the multiplicity of each of `readings` (indices, shape (N,)) by one."""
         self._check_indices(readings, self._size)
         repeated = self.state.cones[readings]
-        since = united(self._since, box_of(repeated, self.grid))
+        since = united(self._not_renewed, box_of(repeated, self.grid))
         add_multiplicity(self.state, readings)
-        if self._sums is not None:
-            keep_bearings(repeated, self.grid, self._sums)
-            self._since = since
+        if self._bearing_sums is not None:
+            keep_bearings(repeated, self.grid, self._bearing_sums)
+            self._not_renewed = since
 
     def grow(self, grid: Grid) -> None:
         """Change to a larger grid, whose new cells are free; if it fails, nothing is changed.
@@ -193,7 +199,7 @@ class Evidence(IndexedReadings):
             If `stop` was set.
         MemoryError
         """
-        old, s, totals, sums = self.grid, self.state, self._totals, self._sums
+        old, s, totals, sums = self.grid, self.state, self._totals, self._bearing_sums
         window = grid.window(old)
         occupied = np.zeros(grid.shape, np.uint8)
         occupied[window] = s.maps.occupied.reshape(old.shape)
@@ -213,7 +219,7 @@ class Evidence(IndexedReadings):
             larger = np.zeros((3, grid.size), np.int64)
             larger.reshape(3, *grid.shape)[(slice(None), *window)] = sums.reshape(3, *old.shape)
         evaluating = False
-        self.grid, self.state, self._totals, self._sums = grid, grown, np.zeros(6, np.int64), larger
+        self.grid, self.state, self._totals, self._bearing_sums = grid, grown, np.zeros(6, np.int64), larger
         try:
             if sums is None and len(s.normals.known):
                 self._learn_normals(self._size)
@@ -221,15 +227,15 @@ class Evidence(IndexedReadings):
             evaluating = True
             self._evaluate_and_add(0, self._size, new=True)
         except BaseException:
-            self.grid, self.state, self._totals, self._sums = old, s, totals, sums
+            self.grid, self.state, self._totals, self._bearing_sums = old, s, totals, sums
             if evaluating:
                 # pairs of the larger grid were written over those of the old one
-                self._evaluate_again(self._size, new=True)
+                self._evaluate_from_scratch(self._size, new=True)
             raise
-        if self._since:
+        if self._not_renewed:
             up, right = window[0].start, window[1].start
-            bottom, top, left, end = self._since
-            self._since = bottom + up, top + up, left + right, end + right
+            bottom, top, left, end = self._not_renewed
+            self._not_renewed = bottom + up, top + up, left + right, end + right
 
     def rebuild(self) -> None:
         """Evaluate all readings again, after the map was changed from outside."""
@@ -239,7 +245,7 @@ class Evidence(IndexedReadings):
         try:
             self._evaluate_and_add(0, self._size, new=False)
         except BaseException:
-            self._evaluate_again(self._size)
+            self._evaluate_from_scratch(self._size)
             raise
 
     def flip(self, cells: NDArray[np.int64]) -> None:
@@ -268,9 +274,9 @@ class Evidence(IndexedReadings):
             evaluate_flipped(s._replace(maps=s.maps._replace(evidence=evidence)), first, last, flipped)
 
         try:
-            self.summed(0, self._size, work, maps.evidence)
+            self.sum_over_readings(0, self._size, work, maps.evidence)
         except BaseException:
-            self._evaluate_again(self._size)
+            self._evaluate_from_scratch(self._size)
             raise
 
     def renew_normals(self) -> Window | None:
@@ -283,30 +289,32 @@ class Evidence(IndexedReadings):
         window : first row, last one plus one, and columns likewise, or None
             Where the evidence changed.
         """
-        if self._sums is None or self._since is None:
+        if self._bearing_sums is None or self._not_renewed is None:
             return None
         s, shape = self.state, self.grid.shape
         # readings affect the normals around them, and these the limits of the incidence angle around them
-        around = touched(touched(self._since, self.grid), self.grid)
-        normals = renewed_normals(s, self._size, self.grid, self.model, self._sums, around)
+        around = touched(touched(self._not_renewed, self.grid), self.grid)
+        normals = renewed_normals(s, self._size, self.grid, self.model, self._bearing_sums, around)
         differ = np.zeros(shape, np.uint8)
         changed = np.zeros(self._size, np.uint8)
         find_changed(s, normals, around, differ, changed)
         readings = np.flatnonzero(changed)
         window = box_of(s.cones[readings], self.grid)
         # nothing can fail from here on: without memory, pairs are not stored
-        done, words = 0, self._words
+        done, words = 0, self._most_words
         while True:
             done = renew(self.state, normals, readings, (done, words), self._totals)
             if done == len(readings):
                 break
             try:
-                self._make_room(int(self._totals[WORDS]) + WORDS_PER_BAND_PAIR * int(self._totals[LARGEST]))
+                self._allocate_pairs(
+                    int(self._totals[ALLOCATED_WORDS]) + WORDS_PER_BAND_PAIR * int(self._totals[LARGEST_CONE])
+                )
             except MemoryError:
                 words = len(self.state.pairs.cell)
         self.state = self.state._replace(normals=normals)
-        self._since = None
-        if self._totals[UNUSED] > MOST_UNUSED * self._totals[WORDS]:
+        self._not_renewed = None
+        if self._totals[UNUSED_WORDS] > MOST_UNUSED * self._totals[ALLOCATED_WORDS]:
             # packing only saves memory, so it is skipped if there is none
             with suppress(MemoryError):
                 self.grow(self.grid)
@@ -316,9 +324,9 @@ class Evidence(IndexedReadings):
         def work(s: State, first: int, last: int, evidence: NDArray[np.int64]) -> None:
             evaluate_all(s._replace(maps=s.maps._replace(evidence=evidence)), first, last, new)
 
-        self.summed(begin, end, work, self.state.maps.evidence)
+        self.sum_over_readings(begin, end, work, self.state.maps.evidence)
 
-    def _evaluate_again(self, end: int, new: bool = False) -> None:
+    def _evaluate_from_scratch(self, end: int, new: bool = False) -> None:
         """Evaluate the readings up to `end` from scratch. It cannot fail: it is single-threaded and ignores `stop`."""
         self.state.maps.evidence[:] = 0
         evaluate_all(self.state._replace(stop=NEVER), 0, end, new)
@@ -326,6 +334,6 @@ class Evidence(IndexedReadings):
     def _learn_normals(self, end: int) -> None:
         """Estimate normals and limits of the incidence angle from the first readings."""
         self._indexed = 0
-        sums = np.zeros((3, self.grid.size), np.int64) if self._sums is None else self._sums
-        normals = first_normals(self.state, end, self.grid, self.model, sums, self.summed)
+        sums = np.zeros((3, self.grid.size), np.int64) if self._bearing_sums is None else self._bearing_sums
+        normals = first_normals(self.state, end, self.grid, self.model, sums, self.sum_over_readings)
         self.state = self.state._replace(normals=normals)

@@ -1,4 +1,8 @@
-"""Readings on a grid, indexed by its cells, and the memory for them; `evidence` evaluates them."""
+"""The lower half of `Evidence`: readings on a grid, indexed by its cells, and the memory for them.
+
+This half knows nothing of a map: it counts and indexes the cells in the cones of readings. `evidence` makes their
+pairs and evaluates them.
+"""
 
 from __future__ import annotations
 
@@ -19,7 +23,7 @@ from ..sensor.cone_table import CONE, Cones
 from ..sensor.density import hit_probability
 from ..sensor.surface_normals import SurfaceNormals
 from .fixed_point import QUANTUM
-from .indexing import BAND, FREE, LARGEST, UNSTORED, WORDS, insert_readings
+from .indexing import ALLOCATED_WORDS, BAND_PAIRS, FREE_PAIRS, LARGEST_CONE, UNSTORED_READINGS, insert_readings
 from .neighbourhood import set_patterns
 from .pairs import WORD, Lattice, empty_pairs, workspace_for
 from .state import BLOCK_SHIFT, READING_STATE, Maps, Model, State, Work
@@ -30,8 +34,8 @@ BYTES_A_CONE_CELL = 64
 """Bytes of a workspace for each cell of the largest cone."""
 
 
-class _Before(NamedTuple):
-    """State that must be restored if adding readings fails."""
+class _IndexState(NamedTuple):
+    """State that must be restored if adding readings fails: fields of `Tiles`, the totals, and the normals."""
 
     head: NDArray[np.int32]
     fill: NDArray[np.int32]
@@ -51,6 +55,10 @@ def empty_maps(grid: Grid, occupied: NDArray[np.uint8]) -> Maps:
 
 class IndexedReadings:
     """Cones of readings on a grid, their pairs with cells as far as there is memory, and work on them by threads.
+
+    `Evidence` adds readings in this order: `_allocate_readings` makes room for them, and their cones are written there;
+    `_insert` indexes them, and makes room for their pairs; then the pairs are made. If `_insert` or a later step fails,
+    `_restore_index` returns to what `_index_state` was before. In the end, `_size` grows.
 
     Attributes
     ----------
@@ -74,8 +82,10 @@ class IndexedReadings:
         self.grid, self.model, self._threads = grid, model, threads
         # its threads begin when they are needed, and end with this object; starting them each time takes longer
         self._pool = ThreadPoolExecutor(threads)
-        self._words = int(min(memory / WORD, 2.0**60))
+        self._most_words = int(min(memory / WORD, 2.0**60))
+        # by the indices of `indexing`, such as ALLOCATED_WORDS
         self._totals = np.zeros(6, np.int64)
+        # numbers of readings that were added, and that are indexed; the latter is larger only within `Evidence.extend`
         self._size = self._indexed = 0
         self.state = State(
             normals=normals,
@@ -102,12 +112,12 @@ class IndexedReadings:
     @property
     def pairs(self) -> int:
         """Number of pairs of a cell and a reading."""
-        return int(self._totals[FREE] + self._totals[BAND])
+        return int(self._totals[FREE_PAIRS] + self._totals[BAND_PAIRS])
 
     @property
     def unstored(self) -> int:
         """Number of readings whose pairs are not stored, for lack of memory."""
-        return int(self._totals[UNSTORED])
+        return int(self._totals[UNSTORED_READINGS])
 
     @property
     def nbytes(self) -> int:
@@ -133,7 +143,7 @@ class IndexedReadings:
         if len(readings) and not 0 <= readings.min() <= readings.max() < size:
             raise ValueError(f'readings {readings.min()} to {readings.max()} are asked for, and there are {size}')
 
-    def summed(self, begin: int, end: int, work: Work, total: NDArray[np.int64], beside: int = 0) -> None:
+    def sum_over_readings(self, begin: int, end: int, work: Work, total: NDArray[np.int64], beside: int = 0) -> None:
         """Run work on several threads, each for a part of the readings `begin` to `end`, and sum the results.
 
         Each thread has its own workspace and array. Integer sums do not depend on the number of threads.
@@ -152,7 +162,7 @@ class IndexedReadings:
         Cancelled
             If `stop` was set.
         """
-        largest = int(self._totals[LARGEST])
+        largest = int(self._totals[LARGEST_CONE])
         own = [(self.state, total)]
         each = total.nbytes + beside + BYTES_A_CONE_CELL * largest
         most = len(parts(begin, end, min(self._threads, 1 + THREAD_MEMORY // max(each, 1))))
@@ -169,24 +179,25 @@ class IndexedReadings:
         for _, array in own[1:]:
             np.add(total, array, out=total)
 
-    def _index_so_far(self) -> _Before:
+    def _index_state(self) -> _IndexState:
+        """Return a copy of the state for `_restore_index`."""
         s = self.state
         tiles = s.tiles
         lists = tiles.head.copy(), tiles.fill.copy(), tiles.latest.copy()
-        return _Before(*lists, int(tiles.used[0]), self._totals.copy(), s.normals)
+        return _IndexState(*lists, int(tiles.used[0]), self._totals.copy(), s.normals)
 
     def _insert(self, begin: int, end: int) -> None:
         """Index readings whose cones are set, and allocate memory for their pairs."""
         self._indexed = begin
         while self._indexed < end:
             s = self.state
-            self._indexed = insert_readings(s, (self._indexed, end, self._words), self._totals)
+            self._indexed = insert_readings(s, (self._indexed, end, self._most_words), self._totals)
             check(s.stop)
             if self._indexed < end:
                 self.state = s._replace(tiles=more_chunks(s.tiles))
-        self._make_room(int(self._totals[WORDS]))
+        self._allocate_pairs(int(self._totals[ALLOCATED_WORDS]))
 
-    def _take_out(self, begin: int, before: _Before) -> None:
+    def _restore_index(self, begin: int, before: _IndexState) -> None:
         """Undo the indexing from reading `begin` on."""
         s = self.state
         forget(s, begin, self._indexed)
@@ -196,7 +207,7 @@ class IndexedReadings:
         self._totals[:] = before.totals
         self.state = s._replace(normals=before.normals)
 
-    def _reserve(self, size: int) -> None:
+    def _allocate_readings(self, size: int) -> None:
         """Allocate memory for `size` readings, and for half as many more if there are readings already."""
         s = self.state
         if size <= len(s.reading_states):
@@ -206,13 +217,13 @@ class IndexedReadings:
         cones[: self._size], reading_states[: self._size] = s.cones[: self._size], s.reading_states[: self._size]
         self.state = s._replace(cones=cones, reading_states=reading_states, observing=np.empty((room, 2), np.int32))
 
-    def _make_room(self, words: int) -> None:
+    def _allocate_pairs(self, words: int) -> None:
         """Allocate this many words of pairs, and a workspace for the largest cone."""
         s = self.state
-        largest, words = int(self._totals[LARGEST]), min(words, self._words)
+        largest, words = int(self._totals[LARGEST_CONE]), min(words, self._most_words)
         if words > len(s.pairs.cell):
             kept = len(s.pairs.cell)
-            pairs = empty_pairs(words if not kept else max(words, min(words * 3 // 2, self._words)))
+            pairs = empty_pairs(words if not kept else max(words, min(words * 3 // 2, self._most_words)))
             pairs.cell[:kept] = s.pairs.cell
             s = s._replace(pairs=pairs)
         if largest + 3 > len(s.workspace.new):

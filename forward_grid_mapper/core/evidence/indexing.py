@@ -17,7 +17,7 @@ from .pairs import WORDS_PER_BAND_PAIR, WORDS_PER_RUN
 from .state import READING_STATE, State
 from .tile_index import SHIFT, insert
 
-FREE, BAND, LARGEST, WORDS, UNSTORED, UNUSED = range(6)
+FREE_PAIRS, BAND_PAIRS, LARGEST_CONE, ALLOCATED_WORDS, UNSTORED_READINGS, UNUSED_WORDS = range(6)
 """Indices of totals: pairs in free zones and in bands, cells of the largest cone, words allocated to readings, readings
 that are not stored, and allocated words that are no longer used."""
 
@@ -62,16 +62,16 @@ def insert_readings(s: State, limits: tuple[int, int, int], totals: Any) -> int:
                 band += right - left + 1 - inside
         reading_state = s.reading_states[t]
         size = WORDS_PER_RUN * count + WORDS_PER_BAND_PAIR * band
-        reading_state.at = totals[WORDS]
+        reading_state.at = totals[ALLOCATED_WORDS]
         reading_state.room = size
-        reading_state.stored = totals[WORDS] + size <= words
+        reading_state.stored = totals[ALLOCATED_WORDS] + size <= words
         if reading_state.stored:
-            totals[WORDS] += size
+            totals[ALLOCATED_WORDS] += size
         else:
-            totals[UNSTORED] += 1
-        totals[FREE] += free
-        totals[BAND] += band
-        totals[LARGEST] = max(totals[LARGEST], free + band)
+            totals[UNSTORED_READINGS] += 1
+        totals[FREE_PAIRS] += free
+        totals[BAND_PAIRS] += band
+        totals[LARGEST_CONE] = max(totals[LARGEST_CONE], free + band)
     return end
 
 

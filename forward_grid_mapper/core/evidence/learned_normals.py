@@ -15,8 +15,8 @@ from ..sensor.surface_normals import SurfaceNormals, gather, normals_of, renewed
 from .renewal import near
 from .state import State, Work
 
-Summed = Callable[[int, int, Work, NDArray[np.int64]], None]
-"""Runs such work on several threads for a range of readings, and sums the results (`Evidence.summed`)."""
+SumOverReadings = Callable[[int, int, Work, NDArray[np.int64]], None]
+"""Runs such work on several threads for a range of readings, and sums the results (`Evidence.sum_over_readings`)."""
 
 NO_INCIDENCE_LIMIT = 1.5707
 """Largest incidence angle, radians, from which on there is no limit."""
@@ -28,7 +28,7 @@ def has_limit(model: ModelParameters) -> bool:
 
 
 def first_normals(
-    s: State, end: int, grid: Grid, model: ModelParameters, sums: NDArray[np.int64], summed: Summed
+    s: State, end: int, grid: Grid, model: ModelParameters, sums: NDArray[np.int64], sum_over_readings: SumOverReadings
 ) -> SurfaceNormals:
     """Return the normals from the readings up to `end`.
 
@@ -40,13 +40,13 @@ def first_normals(
     model : ModelParameters
     sums : int64, shape (3, cells)
         Output of `gather`; must be 0 before.
-    summed : callable
+    sum_over_readings : callable
     """
 
     def gathered(s: State, first: int, last: int, into: NDArray[np.int64]) -> None:
         gather(s.cones, grid.shape, (first, last), into, s.stop)
 
-    summed(0, end, gathered, sums)
+    sum_over_readings(0, end, gathered, sums)
     normals, edges = normals_of(sums, grid, model.max_incidence_angle), edges_of(model)
     if edges is None:
         return normals
@@ -58,7 +58,7 @@ def first_normals(
     def counted(s: State, first: int, last: int, into: NDArray[np.int64]) -> None:
         count(s.cones, weights, normals, slots, whole, edges, (first, last), into, s.stop)
 
-    summed(0, end, counted, counts)
+    sum_over_readings(0, end, counted, counts)
     return narrowed(normals, counts, slots, edges, grid, whole)
 
 

@@ -18,7 +18,7 @@ from ..runtime.jit import kernel
 from ..sensor.cone import rows_of, runs_of
 from ..sensor.cone_table import cone_of
 from ..sensor.surface_normals import SurfaceNormals, exceeds_incidence_angle
-from .indexing import UNSTORED, UNUSED, WORDS
+from .indexing import ALLOCATED_WORDS, UNSTORED_READINGS, UNUSED_WORDS
 from .pairs import WORDS_PER_BAND_PAIR, WORDS_PER_RUN, make
 from .state import State
 from .tile_index import CHUNK, SHIFT
@@ -118,13 +118,13 @@ def find_changed(s: State, new: SurfaceNormals, window: Window, differ: Any, cha
 @kernel
 def _move(reading_state: Any, size: int, words: int, totals: Any) -> None:
     """Give a reading `size` words behind all others; if they would exceed `words` in total, it is not stored."""
-    totals[UNUSED] += reading_state.room
-    reading_state.stored = totals[WORDS] + size <= words
+    totals[UNUSED_WORDS] += reading_state.room
+    reading_state.stored = totals[ALLOCATED_WORDS] + size <= words
     if reading_state.stored:
-        reading_state.at, reading_state.room = totals[WORDS], size
-        totals[WORDS] += size
+        reading_state.at, reading_state.room = totals[ALLOCATED_WORDS], size
+        totals[ALLOCATED_WORDS] += size
     else:
-        totals[UNSTORED] += 1
+        totals[UNSTORED_READINGS] += 1
 
 
 @kernel
@@ -149,7 +149,7 @@ def renew(s: State, new: SurfaceNormals, readings: Any, limits: tuple[int, int],
         if reading_state.stored:
             runs, bands = make(s.cones, s.lattice, new, t, workspace.pairs, start, workspace)
             size = WORDS_PER_RUN * runs + WORDS_PER_BAND_PAIR * bands
-            if size > reading_state.room and len(s.pairs.cell) < totals[WORDS] + size <= words:
+            if size > reading_state.room and len(s.pairs.cell) < totals[ALLOCATED_WORDS] + size <= words:
                 return i
             subtract(s, t)
             if size > reading_state.room:

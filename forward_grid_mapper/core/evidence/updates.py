@@ -1,4 +1,4 @@
-"""Flips of single cells: the M-step with an exact E-step in both directions, and the gain of flipping each cell.
+"""The gain of flipping each cell, from the likelihoods of the readings: the E-step, exact for both states of a cell.
 
 Let p(z_t | m) = c + T, where c is the density of the causes independent of the map, and T that of obstacles and max
 range. For a cell at distance d, let A be the part of T from occupied cells before it, n the number of these,
@@ -12,8 +12,8 @@ same for all free cells of the free zone (A = 0, g = 0). For the free cells betw
 ratio is linear in g.
 
 The evidence of a cell is the sum of these logs over its readings: the gain of flipping it. The evidence of all cells is
-kept up to date. After a flip, the readings that observe the cell are evaluated again, and the differences are added to
-the evidence of their cells. So the gain of any flip is a table lookup.
+kept up to date. After a flip (`cell_flip`), the readings that observe the cell are evaluated again, and the differences
+are added to the evidence of their cells. So the gain of any flip is a table lookup.
 """
 
 from __future__ import annotations
@@ -25,16 +25,9 @@ import numpy as np
 from ..runtime.jit import inlined_kernel, kernel
 from ..sensor.cone import rows_of, runs_of
 from ..sensor.cone_table import cone_of
-from ..sensor.surface_normals import exceeds_incidence_angle
 from .fixed_point import quantise_logs
-from .neighbourhood import note_flip
-from .pairs import WORDS_PER_RUN, Lattice, Pairs, Workspace, make
-from .state import BLOCK_SHIFT, Maps, Model, State
-from .tile_index import CHUNK, SHIFT
-
-EDGE = 1e-6
-"""Within this distance of the edge of a cone, cells, the exact arithmetic of the cone decides whether a cell is in
-it."""
+from .pairs import WORDS_PER_RUN, Pairs, Workspace, make
+from .state import Maps, Model, State
 
 LEAST_RATIO = 1e-30
 """Smallest likelihood ratio, because of rounding."""
@@ -153,7 +146,7 @@ def _add_to_free_zone(reading_state: Any, pairs: Pairs, at: int, maps: Maps, ste
 
 
 @inlined_kernel
-def _add_difference(reading_state: Any, pairs: Pairs, at: int, maps: Maps, new: Any) -> None:
+def add_difference(reading_state: Any, pairs: Pairs, at: int, maps: Maps, new: Any) -> None:
     """Replace the logs of a reading by those of `evaluate`, and add the differences to the evidence."""
     m, multiplicity = reading_state.bands, reading_state.multiplicity
     cell = np.uint64(at + WORDS_PER_RUN * reading_state.runs)
@@ -181,7 +174,7 @@ def evaluate_and_add(s: State, t: int, pairs: Pairs, at: int) -> None:
     reading_state.blocking = blocking
     reading_state.through = s.model.mixture_weight * (1.0 - s.model.p_hit) ** blocking
     evaluate(s.model, reading_state, maps.occupied, pairs, at, s.workspace)
-    _add_difference(reading_state, pairs, at, maps, s.workspace.new)
+    add_difference(reading_state, pairs, at, maps, s.workspace.new)
     reading_state.changed = s.clock[0]
 
 
@@ -257,7 +250,7 @@ def evaluate_flipped(s: State, begin: int, end: int, flipped: Any) -> None:
                     maps.evidence[c] += step * times * (reading_state.release - reading_state.occupy)
         reading_state.through = s.model.mixture_weight * (1.0 - s.model.p_hit) ** reading_state.blocking
         evaluate(s.model, reading_state, maps.occupied, pairs, at, s.workspace)
-        _add_difference(reading_state, pairs, at, maps, s.workspace.new)
+        add_difference(reading_state, pairs, at, maps, s.workspace.new)
         reading_state.changed = s.clock[0]
 
 
@@ -296,109 +289,3 @@ def add_multiplicity(s: State, readings: Any) -> None:
         for k in range(reading_state.bands):
             maps.evidence[pairs.cell[begin + k]] += pairs.log[log + k]
         _add_seen(s, t, 1)
-
-
-@inlined_kernel
-def _zone(reading: Any, lattice: Lattice, row: int, column: int) -> int:
-    """Return 2 if a cell is in the free zone of a cone, 1 if in its band, 0 if in neither."""
-    du, dv = column + 0.5 - reading.x, row + 0.5 - reading.y
-    along = du * reading.axis_x + dv * reading.axis_y
-    across = abs(dv * reading.axis_x - du * reading.axis_y)
-    outside = across * reading.cosine - along * reading.sine
-    if (outside > EDGE and across > 0.7072) or along > reading.reach + 1.5:
-        return 0
-    away = du * du + dv * dv
-    if outside < -EDGE:
-        if away > (reading.reach + EDGE) ** 2:
-            return 0
-        if reading.free > EDGE and away < (reading.free - EDGE) ** 2:
-            return 2
-        if away < (reading.reach - EDGE) ** 2 and (reading.free < 0.0 or away > (reading.free + EDGE) ** 2):
-            return 1
-    # a cell at the edge, or one that only the axis crosses
-    cone = cone_of(reading)
-    runs = runs_of(cone, row, lattice.width)
-    bottom, top = rows_of(cone, lattice.height)
-    if not bottom <= row < top or not (runs.first <= column <= runs.last or runs.first2 <= column <= runs.last2):
-        return 0
-    return 2 if runs.inner <= column <= runs.outer else 1
-
-
-@kernel
-def find_observing(s: State, c: int) -> int:
-    """List the readings that observe cell c in `observing`; return their number."""
-    row, column = c // s.lattice.width, c % s.lattice.width
-    tile = (row >> SHIFT) * s.tiles.across + (column >> SHIFT)
-    chunk, end = s.tiles.head[tile], s.tiles.fill[tile]
-    n = 0
-    while chunk >= 0:
-        for k in range(end):
-            t = s.tiles.chunks[chunk, k]
-            reading = s.cones[t]
-            zone = _zone(reading, s.lattice, row, column)
-            if zone and s.normals.cos2_limit > 0.0 and s.normals.known[c]:
-                slanted = exceeds_incidence_angle(
-                    s.normals, reading, c, column + 0.5 - reading.x, row + 0.5 - reading.y
-                )
-                zone = 0 if slanted else zone
-            if zone:
-                s.observing[n, 0] = t
-                s.observing[n, 1] = zone - 1
-                n += 1
-        chunk, end = s.tiles.chunks[chunk, CHUNK], CHUNK
-    return n
-
-
-@inlined_kernel
-def _touch_around(s: State, c: int) -> None:
-    """Mark the blocks of the cells whose prior depends on cell c: up to two rows and columns away."""
-    row, column = c // s.lattice.width, c % s.lattice.width
-    left, right = max(column - 2, 0), min(column + 2, s.lattice.width - 1)
-    for other in range(max(row - 2, 0), min(row + 2, s.lattice.height - 1) + 1):
-        s.maps.touched[(other * s.lattice.width + left) >> BLOCK_SHIFT] = 1
-        s.maps.touched[(other * s.lattice.width + right) >> BLOCK_SHIFT] = 1
-
-
-@inlined_kernel
-def _touch_cone(reading_state: Any, pairs: Pairs, at: int, touched: Any) -> None:
-    """Mark the blocks of the cells of a reading."""
-    shift, cell = np.uint64(BLOCK_SHIFT), np.uint64(at + WORDS_PER_RUN * reading_state.runs)
-    for k in range(np.uint64(at), cell, np.uint64(WORDS_PER_RUN)):
-        first, last = np.uint64(pairs.cell[k]), np.uint64(pairs.cell[k + np.uint64(1)])
-        for block in range(first >> shift, (last >> shift) + np.uint64(1)):
-            touched[block] = 1
-    for k in range(np.uint64(reading_state.bands)):
-        touched[np.uint64(pairs.cell[cell + k]) >> shift] = 1
-
-
-@kernel
-def flip(s: State, c: int) -> None:
-    """Flip cell c and update the evidence of all cells."""
-    n = find_observing(s, c)
-    maps = s.maps
-    own = 0
-    for i in range(n):
-        if s.observing[i, 1]:
-            reading_state = s.reading_states[s.observing[i, 0]]
-            own += reading_state.multiplicity * (reading_state.release - reading_state.occupy)
-    # for readings with the cell in the free zone, its ratio changes between that of a free and of an occupied cell
-    maps.evidence[c] += -own if maps.occupied[c] else own
-    maps.occupied[c] ^= 1
-    note_flip(maps.pattern, c, s.lattice.height, s.lattice.width)
-    _touch_around(s, c)
-    step = 1 if maps.occupied[c] else -1
-    s.clock[0] += 1
-    for i in range(n):
-        t: Any = np.int64(s.observing[i, 0])
-        # logs that are not stored must be computed for the map before the flip
-        maps.occupied[c] ^= 1
-        pairs, at = pairs_with_logs(s, t)
-        maps.occupied[c] ^= 1
-        reading_state = s.reading_states[t]
-        if s.observing[i, 1]:
-            reading_state.blocking += step
-            reading_state.through = s.model.mixture_weight * (1.0 - s.model.p_hit) ** reading_state.blocking
-        evaluate(s.model, reading_state, maps.occupied, pairs, at, s.workspace)
-        _add_difference(reading_state, pairs, at, maps, s.workspace.new)
-        _touch_cone(reading_state, pairs, at, maps.touched)
-        reading_state.changed = s.clock[0]

@@ -34,7 +34,7 @@ the results are the same."""
 EIGHTH = math.tan(math.pi / 8)
 """Tangent of the largest angle between a direction and the axis of the lattice that it is assigned to."""
 
-UNIT = 2.0**-20
+PASS_UNIT = 2.0**-20
 """Unit of the integer sums of passes, in readings; integer sums do not depend on their order."""
 
 
@@ -112,9 +112,9 @@ def _obstacles(s: State, t: int, occupied: Any, squares: Any, remaining: Any) ->
 def add_passes(s: State, begin: int, end: int, random: Floats, lost: Floats, occupied: Any, passed: Any) -> None:
     """Add the probabilities that the readings `begin` to `end` passed the cells of their cones to `passed`.
 
-    `passed` is int64, in units of UNIT, shape (DIRECTIONS, cells). All cells of a cone are included, also those beyond
-    the limit of the incidence angle. `random` and `lost` are the densities of `random_density` and p_lost · N(z; z_max,
-    σ) of all readings, 1/m.
+    `passed` is int64, in units of PASS_UNIT, shape (DIRECTIONS, cells). All cells of a cone are included, also those
+    beyond the limit of the incidence angle. `random` and `lost` are the densities of `random_density` and
+    p_lost · N(z; z_max, σ) of all readings, 1/m.
     """
     # the band of a cone has no more cells than the largest cone
     squares, remaining = s.workspace.key, np.empty(len(s.workspace.key) + 1)
@@ -123,7 +123,7 @@ def add_passes(s: State, begin: int, end: int, random: Floats, lost: Floats, occ
             break
         reading, reading_state = s.cones[t], s.reading_states[t]
         n, blocking, near = _obstacles(s, t, occupied, squares, remaining)
-        scale = reading_state.multiplicity / ((random[t] + lost[t] + remaining[0]) * UNIT)
+        scale = reading_state.multiplicity / ((random[t] + lost[t] + remaining[0]) * PASS_UNIT)
         stray = random[t] * scale if reading.z < reading.z_max else 0.0
         in_front = remaining[0] * scale + stray
         hidden = remaining[0] * scale + stray * (1.0 - s.model.p_hit) ** blocking
@@ -169,11 +169,11 @@ def count_passes(passed: Any, noticed: Any, p_hit: float, whole: Any, out: Any) 
     for c in range(len(out)):
         least, whole[c] = np.inf, 0.0
         for j in range(len(noticed)):
-            whole[c] += passed[j, c] * UNIT
+            whole[c] += passed[j, c] * PASS_UNIT
             each[j] = 0.0
             for k in range(len(noticed)):
                 each[j] += noticed[j, k] * passed[k, c]
-            each[j] *= UNIT
+            each[j] *= PASS_UNIT
             least = min(least, each[j])
         if whole[c] == 0.0:
             # most cells of a map, and logarithms take most of the time
@@ -186,7 +186,7 @@ def count_passes(passed: Any, noticed: Any, p_hit: float, whole: Any, out: Any) 
 
 
 def passes_by_direction(evidence: Evidence, occupied: NDArray[np.uint8]) -> NDArray[np.int64]:
-    """Return the expected number of passes by direction and cell, in units of UNIT, shape (DIRECTIONS, cells)."""
+    """Return the expected number of passes by direction and cell, in units of PASS_UNIT, shape (DIRECTIONS, cells)."""
     model = evidence.model
     random = random_density(model, evidence.z_max)
     # also for echoes, so that one from nearly z_max frees little more than a reading without echo
@@ -196,7 +196,7 @@ def passes_by_direction(evidence: Evidence, occupied: NDArray[np.uint8]) -> NDAr
     def work(s: State, begin: int, end: int, own: NDArray[np.int64]) -> None:
         add_passes(s, begin, end, random, lost, occupied, own)
 
-    evidence.summed(0, len(evidence), work, passed)
+    evidence.sum_over_readings(0, len(evidence), work, passed)
     return passed
 
 

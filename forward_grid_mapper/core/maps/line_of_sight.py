@@ -28,7 +28,7 @@ from ..runtime.jit import inlined_kernel, kernel
 from ..sensor.cone import rows_of, runs_of, strength
 from ..sensor.cone_table import cone_of
 
-UNIT = 2.0**-20
+ECHO_UNIT = 2.0**-20
 """Unit of the integer counts; integer sums do not depend on their order."""
 
 STEP = 0.5
@@ -53,7 +53,8 @@ def in_line_of_sight(reading: Any, u: float, v: float, until: float, occupied: A
 def add_echoes(s: State, begin: int, end: int, occupied: Any, same_wall: float, echoes: Any) -> None:
     """Add the echoes of the readings `begin` to `end` to the occupied cells that explain them.
 
-    `echoes` is int64, in units of UNIT, shape (2, cells): those in line of sight, and all. `same_wall` is in cells.
+    `echoes` is int64, in units of ECHO_UNIT, shape (2, cells): those in line of sight, and all. `same_wall` is in
+    cells.
     """
     width = s.lattice.width
     for t in range(begin, end):
@@ -63,7 +64,7 @@ def add_echoes(s: State, begin: int, end: int, occupied: Any, same_wall: float, 
         if reading.z >= reading.z_max:
             continue
         cone = cone_of(reading)
-        unit = s.reading_states[t].multiplicity / UNIT
+        unit = s.reading_states[t].multiplicity / ECHO_UNIT
         for row in range(*rows_of(cone, s.lattice.height)):
             v = row + 0.5 - cone.y
             runs = runs_of(cone, row, width)
@@ -140,7 +141,7 @@ def mirror_images(evidence: Evidence, cells: NDArray[np.bool_]) -> NDArray[np.bo
     def work(s: State, begin: int, end: int, own: NDArray[np.int64]) -> None:
         add_echoes(s, begin, end, occupied, SAME_WALL / grid.resolution, own)
 
-    evidence.summed(0, len(evidence), work, echoes)
+    evidence.sum_over_readings(0, len(evidence), work, echoes)
     images = cells.copy()
     keep_images(echoes.reshape(2, *grid.shape), images, round(IMAGE_AROUND / grid.resolution))
     return images
@@ -154,5 +155,5 @@ def not_passed(evidence: Evidence, cells: NDArray[np.bool_]) -> NDArray[np.bool_
         # shared by all threads: once a reading passed a cell, the others are skipped
         remove_passed(s, begin, end, s.maps.occupied, remaining)
 
-    evidence.summed(0, len(evidence), work, np.zeros(0, np.int64))
+    evidence.sum_over_readings(0, len(evidence), work, np.zeros(0, np.int64))
     return remaining.reshape(evidence.grid.shape)

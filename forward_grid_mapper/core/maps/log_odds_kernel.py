@@ -4,7 +4,7 @@ A plane has the log-odds from the readings of one direction. Planes of direction
 and y exchanged, so that the cells of a cone lie in few long rows for any direction.
 
 A cell in no cone has the value `UNTOUCHED`, −0. Adding anything to it, even +0, gives what was added, so the kernel
-needs no test for it. Increments are rounded to `QUANTUM`, so that float64 sums of them are exact.
+needs no test for it. Increments are rounded to `LOG_ODDS_UNIT`, so that float64 sums of them are exact.
 """
 
 from __future__ import annotations
@@ -17,11 +17,11 @@ from numpy.typing import NDArray
 
 from ..runtime.jit import inlined_kernel, kernel
 from ..sensor.cone import HALF_WIDTH, axis_run, make_cone
-from ..sensor.cone_table import UNIT
+from ..sensor.cone_table import COORDINATE_UNIT
 
-QUANTUM = 2.0**-20
-_ROUNDER = 1.5 * 2.0**52 * QUANTUM
-"""Adding and subtracting it rounds to `QUANTUM`, because float64 has no smaller steps at this size."""
+LOG_ODDS_UNIT = 2.0**-20
+_ROUNDER = 1.5 * 2.0**52 * LOG_ODDS_UNIT
+"""Adding and subtracting it rounds to `LOG_ODDS_UNIT`, because float64 has no smaller steps at this size."""
 
 UNTOUCHED = -0.0
 
@@ -96,7 +96,7 @@ def _lattice_place(metres: float, resolution: float) -> tuple[int, float]:
 
     Coordinates are relative to the cell of the sensor, so that rounding does not depend on the corner of the grid.
     """
-    cells = np.rint(metres * (1.0 / resolution) / UNIT) * UNIT
+    cells = np.rint(metres * (1.0 / resolution) / COORDINATE_UNIT) * COORDINATE_UNIT
     cell = math.floor(cells)
     return int(cell), cells - cell
 

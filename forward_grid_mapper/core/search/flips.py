@@ -8,9 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..common.readings import Floats
+from ..evidence.cell_flip import flip
 from ..evidence.neighbourhood import NEIGHBOURS, neighbour
 from ..evidence.state import BLOCK_SHIFT, State
-from ..evidence.updates import flip
 from ..runtime.jit import allocating_kernel, inlined_kernel, kernel
 from .prior import Prior, prior_gain
 

@@ -28,9 +28,9 @@ from ..common.constants import (
     PASSAGE,
 )
 from ..common.readings import Floats
+from ..evidence.cell_flip import flip
 from ..evidence.neighbourhood import DX, DY, NEIGHBOURS
 from ..evidence.state import State
-from ..evidence.updates import flip
 from ..runtime.jit import kernel
 from .flips import Least, gain_of
 from .prior import Prior

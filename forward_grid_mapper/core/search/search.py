@@ -293,7 +293,7 @@ class Search:
             try_shifts(s, readings[begin:end], slot, place, ratio_batch(), own)
             self._all_none.append(place)
 
-        evidence.summed(0, len(readings), work, joint, beside=slot.nbytes)
+        evidence.sum_over_readings(0, len(readings), work, joint, beside=slot.nbytes)
         slot[cells] = -1
         self._all_none.append(slot)
         targets, gains = best_shifts(s, self._prior, LEAST, cells, joint.reshape(-1, NEIGHBOURS))

@@ -19,11 +19,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..common.readings import Floats
+from ..evidence.cell_flip import find_observing, flip
 from ..evidence.fixed_point import RatioWorkspace, quantise_logs, ratio_workspace_for
 from ..evidence.neighbourhood import NEIGHBOURS, neighbour, note_flip
 from ..evidence.pairs import WORDS_PER_RUN, Pairs
 from ..evidence.state import State
-from ..evidence.updates import find_observing, flip, pairs_of, ratios_and_logs
+from ..evidence.updates import pairs_of, ratios_and_logs
 from ..runtime.jit import allocating_kernel, inlined_kernel, kernel
 from .flips import Least, gain_of, least_gain
 from .prior import Prior

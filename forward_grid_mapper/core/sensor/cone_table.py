@@ -37,7 +37,7 @@ kernels access readings in random order.
 
 Cones = NDArray[np.void]
 
-UNIT = 2.0**-32
+COORDINATE_UNIT = 2.0**-32
 """Coordinates are rounded to this, cells; 20 bits of float64 remain for the index of a cell."""
 
 
@@ -148,8 +148,8 @@ def cone_table(readings: Readings, grid: Grid, model: ModelParameters) -> Cones:
 
 
 def _exact(cells: Floats) -> Floats:
-    """Return coordinates rounded to `UNIT`, so that the offset in a cell does not depend on the corner of the grid."""
-    out: Floats = np.round(cells / UNIT) * UNIT
+    """Return coordinates in whole `COORDINATE_UNIT`s: offsets in cells do not depend on the corner of the grid."""
+    out: Floats = np.round(cells / COORDINATE_UNIT) * COORDINATE_UNIT
     return out
 
 

@@ -39,7 +39,7 @@ from ..runtime.cancelling import NEVER
 from ..runtime.jit import inlined_kernel, kernel
 from .cone import rows_of, runs_of, strength
 from .cone_table import Cones, cone_of
-from .surface_normals import QUANTUM, Square, SurfaceNormals, square_of, sum_across, touched, unit_of_sums
+from .surface_normals import WEIGHT_UNIT, Square, SurfaceNormals, square_of, sum_across, touched, unit_of_sums
 
 ZONES = 3
 """Number of zones of incidence; two that are a few degrees wider, or five, are about as good."""
@@ -80,7 +80,7 @@ def count(
     counts: Any,
     stop: Any,
 ) -> None:
-    """Add echoes and passes of the readings `part[0]` to `part[1]` to `counts`, in units of QUANTUM.
+    """Add echoes and passes of the readings `part[0]` to `part[1]` to `counts`, in units of WEIGHT_UNIT.
 
     Parameters
     ----------
@@ -104,7 +104,7 @@ def count(
             break
         reading = cones[t]
         cone = cone_of(reading)
-        unit = weights[t] / QUANTUM
+        unit = weights[t] / WEIGHT_UNIT
         sine2 = reading.sine * reading.sine
         bottom, top = rows_of(cone, window[1])
         for row in range(max(bottom, window[0]), top):

@@ -28,7 +28,7 @@ from ..runtime.jit import inlined_kernel, kernel
 from .cone import rows_of, runs_of
 from .cone_table import Cones, cone_of
 
-QUANTUM = 2.0**-20
+WEIGHT_UNIT = 2.0**-20
 """Unit of the integer sums, which do not depend on their order."""
 
 
@@ -94,7 +94,7 @@ def no_normals() -> SurfaceNormals:
 
 @kernel
 def gather(cones: Cones, shape: tuple[int, int], part: tuple[int, int], sums: Any, stop: Any) -> None:
-    """Add C, S and M of the readings `part[0]` to `part[1]` to `sums`, int64, shape (3, cells), in units of QUANTUM."""
+    """Add C, S and M of the readings `part[0]` to `part[1]` to `sums`, int64, shape (3, cells), in WEIGHT_UNITs."""
     height, width = shape
     for t in range(part[0], part[1]):
         if stop[0]:
@@ -114,7 +114,7 @@ def gather(cones: Cones, shape: tuple[int, int], part: tuple[int, int], sums: An
                     if square <= low:
                         continue
                     error = (math.sqrt(square) - reading.z) / reading.sigma
-                    weight = math.exp(-0.5 * error * error) / QUANTUM
+                    weight = math.exp(-0.5 * error * error) / WEIGHT_UNIT
                     cell = row * width + column
                     sums[0, cell] += int(weight * (u * u - v * v) / square)
                     sums[1, cell] += int(weight * 2.0 * u * v / square)
@@ -141,7 +141,7 @@ def square_of(resolution: float) -> Square:
 
 def unit_of_sums(resolution: float) -> float:
     """Return the factor from sums over `NEIGHBOURHOOD` to weights in cells of `WEIGHT_CELL`."""
-    return float(QUANTUM * (resolution / WEIGHT_CELL) ** 2)
+    return float(WEIGHT_UNIT * (resolution / WEIGHT_CELL) ** 2)
 
 
 @kernel

@@ -15,10 +15,10 @@ from forward_grid_mapper.core.common.errors import Cancelled
 from forward_grid_mapper.core.common.grid import Grid
 from forward_grid_mapper.core.common.parameter_groups import GridParameters, ModelParameters
 from forward_grid_mapper.core.common.readings import Readings
+from forward_grid_mapper.core.evidence.cell_flip import _zone, find_observing, flip
 from forward_grid_mapper.core.evidence.evidence import Evidence
 from forward_grid_mapper.core.evidence.fixed_point import QUANTUM
-from forward_grid_mapper.core.evidence.indexing import reading_state_table
-from forward_grid_mapper.core.evidence.updates import _zone, find_observing, flip
+from forward_grid_mapper.core.evidence.indexing import ALLOCATED_WORDS, reading_state_table
 from forward_grid_mapper.core.runtime import threads
 from forward_grid_mapper.core.search.flips import gain_of
 from forward_grid_mapper.core.search.prior import Prior
@@ -251,7 +251,7 @@ def test_flip_marks_the_readings_that_it_changed() -> None:
 def test_state_does_not_depend_on_how_many_readings_are_stored(seed: int, part: float) -> None:
     readings, model, occupied = random_case(seed, 150)
     whole = evidence_of(readings, model, occupied)
-    words = int(whole._totals[3])
+    words = int(whole._totals[ALLOCATED_WORDS])
     less = evidence_of(readings, model, occupied, memory=part * 4 * words)
     assert whole.unstored == 0 < less.unstored
     assert less.unstored < len(readings) or part == 0.0

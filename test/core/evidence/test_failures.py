@@ -33,8 +33,8 @@ def full_state(evidence: Evidence) -> list[object]:
     """The whole state, including normals of surfaces and the readings of each tile."""
     normals, tiles = evidence.state.normals, evidence.state.tiles
     lists = [tiles.head.tolist(), tiles.fill.tolist(), tiles.latest.tolist(), int(tiles.used[0])]
-    sums = [] if evidence._sums is None else evidence._sums.tolist()
-    counts = [len(evidence), evidence.pairs, evidence.unstored, evidence.grid, evidence._since]
+    sums = [] if evidence._bearing_sums is None else evidence._bearing_sums.tolist()
+    counts = [len(evidence), evidence.pairs, evidence.unstored, evidence.grid, evidence._not_renewed]
     return [snapshot(evidence), [np.asarray(array).tolist() for array in normals], lists, sums, counts]
 
 

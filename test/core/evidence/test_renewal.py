@@ -12,8 +12,8 @@ from forward_grid_mapper.core.common.grid import Grid
 from forward_grid_mapper.core.common.parameter_groups import ModelParameters
 from forward_grid_mapper.core.common.readings import Readings
 from forward_grid_mapper.core.evidence import evidence as module
-from forward_grid_mapper.core.evidence.evidence import UNUSED, Evidence
-from forward_grid_mapper.core.evidence.updates import find_observing, flip
+from forward_grid_mapper.core.evidence.cell_flip import find_observing, flip
+from forward_grid_mapper.core.evidence.evidence import UNUSED_WORDS, Evidence
 from samples import random_readings
 
 GRID = Grid(0.1, -7, 12, 25, 20)
@@ -157,8 +157,8 @@ def test_unused_words_of_pairs_are_removed(monkeypatch: pytest.MonkeyPatch) -> N
     readings = along_wall(400)
     monkeypatch.setattr(module, 'MOST_UNUSED', 1.0)
     loose = portions(readings, math.inf)
-    assert loose._totals[UNUSED] > 0
+    assert loose._totals[UNUSED_WORDS] > 0
     monkeypatch.setattr(module, 'MOST_UNUSED', 0.0)
     packed = portions(readings, math.inf)
-    assert packed._totals[UNUSED] == 0
+    assert packed._totals[UNUSED_WORDS] == 0
     assert snapshot(loose) == snapshot(packed)

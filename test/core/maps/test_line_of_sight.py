@@ -15,7 +15,7 @@ from forward_grid_mapper.core.common.parameters import Parameters
 from forward_grid_mapper.core.common.readings import Readings
 from forward_grid_mapper.core.evidence.evidence import Evidence
 from forward_grid_mapper.core.mapping import Mapper
-from forward_grid_mapper.core.maps.line_of_sight import UNIT, add_echoes, mirror_images, not_passed
+from forward_grid_mapper.core.maps.line_of_sight import ECHO_UNIT, add_echoes, mirror_images, not_passed
 from forward_grid_mapper.core.runtime import threads
 from samples import random_readings
 
@@ -46,7 +46,7 @@ def test_echoes_and_passes_are_those_of_the_twin(seed: int) -> None:
     echoes = np.zeros((2, GRID.size), np.int64)
     add_echoes(evidence.state, 0, len(readings), evidence.state.maps.occupied, 3.0, echoes)
     expected = naive.explained_echoes(readings, GRID, occupied, MODEL)
-    assert np.abs(echoes * UNIT - expected).max() < 1e-4
+    assert np.abs(echoes * ECHO_UNIT - expected).max() < 1e-4
     assert 0 < expected[0].sum() < expected[1].sum()
     free = ~occupied.reshape(GRID.shape)
     actual = not_passed(evidence, free)

@@ -16,7 +16,7 @@ from forward_grid_mapper.core.common.readings import Readings
 from forward_grid_mapper.core.evidence.evidence import Evidence
 from forward_grid_mapper.core.evidence.fixed_point import QUANTUM
 from forward_grid_mapper.core.maps.free_space import (
-    UNIT,
+    PASS_UNIT,
     count_passes,
     direction_of,
     expected_passes,
@@ -64,7 +64,7 @@ def test_expected_passes_are_those_of_the_twin(seed: int, filled: float) -> None
     evidence = made(readings, model, occupied)
     actual = expected_passes(evidence, occupied)
     expected = naive.passed(readings, GRID, occupied, model)
-    assert np.abs(passes_by_direction(evidence, occupied) * UNIT - expected).max() < 2e-6 * len(readings)
+    assert np.abs(passes_by_direction(evidence, occupied) * PASS_UNIT - expected).max() < 2e-6 * len(readings)
     assert np.abs(actual.all - expected.sum(axis=0)).max() < 8e-6 * len(readings)
     assert (actual.all <= evidence.state.maps.seen + 1e-9).all()
     assert np.abs(actual.noticing - actual.all).max() < 1e-9, (
@@ -81,11 +81,11 @@ def test_noticing_passes_are_those_of_the_twin(seed: int, angle: float) -> None:
     rng = np.random.default_rng(seed)
     passes = np.where(rng.random((4, 50)) < 0.3, 0.0, rng.gamma(0.7, 3.0, (4, 50)))
     passes[:, :2] *= 1000.0
-    passed, whole, out = np.round(passes / UNIT).astype(np.int64), np.empty(50), np.empty(50)
+    passed, whole, out = np.round(passes / PASS_UNIT).astype(np.int64), np.empty(50), np.empty(50)
     p_hit = rng.choice([0.05, 0.65, 0.98])
     count_passes(passed, noticed_by(angle), p_hit, whole, out)
-    assert np.array_equal(whole, passed.sum(axis=0) * UNIT)
-    expected = naive.noticing(passed * UNIT, p_hit, angle)
+    assert np.array_equal(whole, passed.sum(axis=0) * PASS_UNIT)
+    expected = naive.noticing(passed * PASS_UNIT, p_hit, angle)
     finite = np.isfinite(expected)
     assert finite[2:].all()
     assert out[finite] == pytest.approx(expected[finite], rel=5e-3, abs=2e-3)

@@ -11,10 +11,10 @@ from hypothesis import strategies as st
 from move_cases import GRID, PRIORS, gain, height, neighbours, prior_of, random_case, seeds
 
 from forward_grid_mapper.core.common.grid import Grid
+from forward_grid_mapper.core.evidence.cell_flip import flip
 from forward_grid_mapper.core.evidence.evidence import Evidence
 from forward_grid_mapper.core.evidence.fixed_point import QUANTUM
 from forward_grid_mapper.core.evidence.state import BLOCK_SHIFT
-from forward_grid_mapper.core.evidence.updates import flip
 from forward_grid_mapper.core.search.flips import (
     WORTH_WAITING,
     any_above,

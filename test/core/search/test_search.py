@@ -16,8 +16,8 @@ from forward_grid_mapper.core.common.errors import Cancelled
 from forward_grid_mapper.core.common.grid import Grid
 from forward_grid_mapper.core.common.parameter_groups import ModelParameters, SearchParameters
 from forward_grid_mapper.core.common.readings import Readings
+from forward_grid_mapper.core.evidence.cell_flip import flip
 from forward_grid_mapper.core.evidence.evidence import Evidence
-from forward_grid_mapper.core.evidence.updates import flip
 from forward_grid_mapper.core.maps.uncertainty import marginals
 from forward_grid_mapper.core.search import search as search_module
 from forward_grid_mapper.core.search.flips import gain_of

@@ -11,10 +11,10 @@ from hypothesis import strategies as st
 from move_cases import GRID, PRIORS, height, model_of, neighbours, prior_of, random_case, seeds
 
 import naive
+from forward_grid_mapper.core.evidence.cell_flip import flip
 from forward_grid_mapper.core.evidence.evidence import Evidence
 from forward_grid_mapper.core.evidence.fixed_point import QUANTUM
 from forward_grid_mapper.core.evidence.neighbourhood import patterns
-from forward_grid_mapper.core.evidence.updates import flip
 from forward_grid_mapper.core.search.prior import Prior
 from forward_grid_mapper.core.search.search import LEAST
 from forward_grid_mapper.core.search.shifts import (

@@ -16,7 +16,7 @@ from forward_grid_mapper.core.common.parameter_groups import GridParameters, Mod
 from forward_grid_mapper.core.common.readings import Readings
 from forward_grid_mapper.core.sensor.cone import axis_run, rows_of, runs_of, within
 from forward_grid_mapper.core.sensor.cone_table import (
-    UNIT,
+    COORDINATE_UNIT,
     _widest,
     cone_of,
     cone_table,
@@ -59,7 +59,7 @@ def test_cone_has_the_cells_within_the_angle_and_those_on_the_axis(make: Make, g
         assert set(smaller) <= set(found) <= set(larger)
         for cell, d in found.items():
             assert d * grid.resolution == pytest.approx(
-                larger[cell] + naive.surface(grid, model), abs=UNIT * grid.resolution
+                larger[cell] + naive.surface(grid, model), abs=COORDINATE_UNIT * grid.resolution
             )
 
 

@@ -26,7 +26,7 @@ from forward_grid_mapper.core.sensor.incidence import (
     no_counts,
     slots_of,
 )
-from forward_grid_mapper.core.sensor.surface_normals import QUANTUM, SurfaceNormals, gather, normals_of, square_of
+from forward_grid_mapper.core.sensor.surface_normals import WEIGHT_UNIT, SurfaceNormals, gather, normals_of, square_of
 from samples import random_readings
 
 GRID = Grid(0.1, -25, 0, 50, 40)
@@ -94,7 +94,7 @@ def test_counts_are_those_of_the_twin(readings: Readings) -> None:
     known = slots >= 0
     assert np.array_equal(known, normals.known > 0)
     assert known.sum() > 20
-    assert np.abs(counts[:, slots[known]] * QUANTUM - expected[:, known]).max() < 1e-3
+    assert np.abs(counts[:, slots[known]] * WEIGHT_UNIT - expected[:, known]).max() < 1e-3
     assert expected[:ZONES].sum() > 5
     assert expected[ZONES:].sum() > 5
 
@@ -153,7 +153,7 @@ def test_lengths_of_normals_follow_from_sums_around_each_cell(grid: Grid) -> Non
     readings, whole = before_wall(0.45, 0.9), (0, grid.height, 0, grid.width)
     normals = unit_normals(readings, grid)
     counts, slots = counted(readings, normals, whole, grid=grid)
-    dense = np.where(slots >= 0, counts[:, np.maximum(slots, 0)], 0).reshape(-1, *grid.shape) * QUANTUM
+    dense = np.where(slots >= 0, counts[:, np.maximum(slots, 0)], 0).reshape(-1, *grid.shape) * WEIGHT_UNIT
     made = narrowed(unit_normals(readings, grid), counts, slots, edges_of(MODEL), grid, whole)
     (n, part), seen = square_of(grid.resolution), set[int]()
     weight = np.ones(2 * n + 1)

@@ -15,11 +15,11 @@ from forward_grid_mapper.core.common.constants import LEAST_AGREEMENT, LEAST_WEI
 from forward_grid_mapper.core.common.grid import Grid
 from forward_grid_mapper.core.common.parameter_groups import ModelParameters
 from forward_grid_mapper.core.common.readings import Readings
+from forward_grid_mapper.core.evidence.cell_flip import find_observing, flip
 from forward_grid_mapper.core.evidence.evidence import Evidence
-from forward_grid_mapper.core.evidence.updates import find_observing, flip
 from forward_grid_mapper.core.runtime import threads
 from forward_grid_mapper.core.sensor.surface_normals import (
-    QUANTUM,
+    WEIGHT_UNIT,
     exceeds_incidence_angle,
     gather,
     no_normals,
@@ -69,7 +69,7 @@ def test_normals_are_those_of_the_twin(readings: Readings) -> None:
     sums = sums_of(evidence, (0, len(readings)))
     expected = naive.normals(readings, GRID, model)
     for actual, exact in zip(sums, expected, strict=True):
-        assert np.abs(actual.reshape(GRID.shape) * QUANTUM - exact).max() < 1e-3
+        assert np.abs(actual.reshape(GRID.shape) * WEIGHT_UNIT - exact).max() < 1e-3
     halves = sums_of(evidence, (0, 37)) + sums_of(evidence, (37, len(readings)))
     assert np.array_equal(halves, sums)
     normals = normals_of(sums, GRID, model.max_incidence_angle)
@@ -113,7 +113,7 @@ def test_box_sums_cover_a_square_in_metres_with_fractions_of_cells(resolution: f
                 expected[row, column] += weights[i] * weights[j] * values[y, x]
     square = square_of(resolution)
     assert square == (within, part)
-    assert unit_of_sums(resolution) == pytest.approx(QUANTUM * (resolution / WEIGHT_CELL) ** 2)
+    assert unit_of_sums(resolution) == pytest.approx(WEIGHT_UNIT * (resolution / WEIGHT_CELL) ** 2)
 
     def box_sums(bottom: int, top: int, left: int, right: int) -> np.ndarray:
         out, columns = np.empty((top - bottom, right - left)), np.empty(right - left + 2 * within)
