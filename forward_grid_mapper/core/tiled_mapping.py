@@ -33,7 +33,14 @@ from .runtime.threads import cores
 from .search.prior import log_prior, wall_prior
 from .search.search import Progress
 from .tiles.mosaic import Each, Mosaic
-from .tiles.windows import Given, finished, first_map, found_normals, improved, judged
+from .tiles.tile_steps import (
+    TileInput,
+    estimate_normals,
+    finish_core,
+    judge_readings,
+    search_alone,
+    search_with_neighbours,
+)
 
 T = TypeVar('T')
 
@@ -85,10 +92,10 @@ class TiledMapper:
         p = self._parameters
         readings = in_canonical_order(readings)
         mosaic = Mosaic(readings, map_grid(readings, p), p, self._size)
-        self._visit('normals', mosaic, mosaic.filled, found_normals, mosaic.take_normals)
+        self._visit('normals', mosaic, mosaic.filled, estimate_normals, mosaic.store_normals)
         converged = self._search(mosaic)
-        self._visit('maps of tiles', mosaic, range(len(mosaic.tiling.tiles)), finished, self._finish(mosaic))
-        self._visit('uncertainty', mosaic, mosaic.filled, judged, mosaic.take_judged)
+        self._visit('maps of tiles', mosaic, range(len(mosaic.tiling.tiles)), finish_core, self._finish(mosaic))
+        self._visit('uncertainty', mosaic, mosaic.filled, judge_readings, mosaic.store_judged)
         begun = time.perf_counter()
         watch('standard map', None)
         live = LogOddsMap(p)
@@ -103,18 +110,18 @@ class TiledMapper:
         mosaic: Mosaic,
         numbers: Iterable[int],
         work: Callable[..., T],
-        take: Callable[[int, T], None],
-        given: Callable[[int], Given] | None = None,
+        store: Callable[[int, T], None],
+        input_of: Callable[[int], TileInput] | None = None,
     ) -> None:
         """Process tiles, and store the results."""
         check(self._stop)
         self._watch(stage, None)
         begun = time.perf_counter()
         numbers = list(numbers)
-        found = self._each(partial(work, parameters=self._of_a_tile), map(given or mosaic.given, numbers))
+        found = self._each(partial(work, parameters=self._of_a_tile), map(input_of or mosaic.input_of, numbers))
         for number, result in zip(numbers, found, strict=True):
             check(self._stop)
-            take(number, result)
+            store(number, result)
         self._seconds[stage] = self._seconds.get(stage, 0.0) + time.perf_counter() - begun
 
     def _search(self, mosaic: Mosaic) -> bool:
@@ -135,18 +142,18 @@ class TiledMapper:
             self._watch('search', self._progress)
 
         def first(number: int, found: Any) -> None:
-            mosaic.take_first(number, found)
+            mosaic.store_first(number, found)
             count(found.progress, found.converged)
 
         def improve(number: int, found: Any) -> None:
-            mosaic.take(number, found)
+            mosaic.store_window(number, found)
             count(found.progress, found.converged)
 
-        self._visit('search', mosaic, mosaic.filled, first_map, first, mosaic.given_first)
+        self._visit('search', mosaic, mosaic.filled, search_alone, first, mosaic.first_input_of)
         while mosaic.schedule.stale:
             for colour in mosaic.tiling.colours:
                 if numbers := mosaic.schedule.of(colour):
-                    self._visit('search', mosaic, numbers, improved, improve)
+                    self._visit('search', mosaic, numbers, search_with_neighbours, improve)
         return not open_ends
 
     def _finish(self, mosaic: Mosaic) -> Callable[[int, Any], None]:
@@ -154,7 +161,7 @@ class TiledMapper:
         self._searched = 0.0
 
         def take(number: int, found: Any) -> None:
-            mosaic.take_finished(number, found)
+            mosaic.store_finished(number, found)
             self._pairs += found.pairs
             self._bytes += found.nbytes
             self._unstored += found.unstored

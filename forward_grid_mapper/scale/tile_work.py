@@ -27,10 +27,10 @@ from ..core.evidence.neighbourhood import patterns
 from ..core.learning.sensor_health import health_counts
 from ..core.maps.log_odds_map import LogOddsMap
 from ..core.search.prior import log_prior, wall_prior
-from ..core.tiles import windows
+from ..core.tiles import tile_steps
 from ..core.tiles.mosaic import FIRST_AROUND
+from ..core.tiles.tile_steps import SearchedWindow, TileInput
 from ..core.tiles.tiling import Tile, boxes_of, common_part
-from ..core.tiles.windows import Given, Searched
 from .job import Job, Plan, plan_of, task
 from .tables import COLUMNS, columns_of, read_table, readings_of, write_table
 from .work_folder import outcome_in, read_arrays, write_arrays
@@ -58,8 +58,8 @@ class TileFiles:
         """All stored readings of the tile, in canonical order."""
         return readings_of(read_table(self.path('readings.parquet')), self.plan.sensor_names)
 
-    def given(self, step: int | None = None, around: float = 0.0, ml: bool = False) -> Given:
-        """Return readings and maps around the tile, as `Mosaic.given` does.
+    def input(self, step: int | None = None, around: float = 0.0, ml: bool = False) -> TileInput:
+        """Return readings and maps around the tile, as `Mosaic.input_of` does.
 
         Parameters
         ----------
@@ -82,7 +82,7 @@ class TileFiles:
         shown = np.full(box.shape, UNKNOWN, np.int8)
         if ml:
             self._cores('maps.npz', 'ml', box, shown)
-        return Given(self.tile, box, readings, own, traversed, occupied, normals, shown)
+        return TileInput(self.tile, box, readings, own, traversed, occupied, normals, shown)
 
     def _cores(self, file: str, name: str, box: Grid, out: NDArray[Any]) -> NDArray[Any]:
         """Fill an array of a box with the data of the tiles in it."""
@@ -125,7 +125,7 @@ def searched(step: int) -> str:
     return f'search_{step:04d}.npz'
 
 
-def prior_of_core(given: Given, occupied: NDArray[np.bool_], job: Job) -> float:
+def prior_of_core(given: TileInput, occupied: NDArray[np.bool_], job: Job) -> float:
     """Return the sum of a map's log prior, shape `box.shape`, over the cells of the core."""
     prior = wall_prior(job.parameters.search, given.traversed.ravel(), given.box.resolution)
     mine = np.zeros(given.box.shape, np.uint8)
@@ -158,7 +158,7 @@ def gather(job: Job, number: int) -> dict[str, Any]:
         inside = cells['row'] - tile.core.row, cells['column'] - tile.core.column
         traversed[inside] = True
     # the files of the drives are kept, since an interrupted job may need them again
-    given = files.given()
+    given = files.input()
     box = given.box
     outcome = {
         'box': [box.resolution, box.column, box.row, box.width, box.height],
@@ -186,7 +186,7 @@ def normals(job: Job, number: int) -> dict[str, Any]:
     files = TileFiles(job, number)
     target = files.path('normals.npz')
     if (before := outcome_in(target)) is None:
-        write_arrays(target, {'normals': windows.found_normals(files.given(), job.parameters)}, before := {})
+        write_arrays(target, {'normals': tile_steps.estimate_normals(files.input(), job.parameters)}, before := {})
     return before
 
 
@@ -198,9 +198,9 @@ def search(job: Job, number: int, step: int) -> dict[str, Any]:
     if (before := outcome_in(target)) is not None:
         return before
     if step == FIRST:
-        found: Searched = windows.first_map(files.given(FIRST, FIRST_AROUND), job.parameters)
+        found: SearchedWindow = tile_steps.search_alone(files.input(FIRST, FIRST_AROUND), job.parameters)
     else:
-        found = windows.improved(files.given(step), job.parameters)
+        found = tile_steps.search_with_neighbours(files.input(step), job.parameters)
     c = found.changed
     outcome = {
         'changed': None if c is None else [c.resolution, c.column, c.row, c.width, c.height],
@@ -218,8 +218,8 @@ def finish(job: Job, number: int) -> dict[str, Any]:
     target = files.path('maps.npz')
     if (before := outcome_in(target)) is not None:
         return before
-    given = files.given()
-    found = windows.finished(given, p)
+    given = files.input()
+    found = tile_steps.finish_core(given, p)
     live = LogOddsMap(p)
     live.add(files.readings)
     outcome = {
@@ -246,8 +246,8 @@ def judge(job: Job, number: int) -> dict[str, Any]:
     target = files.path('judged.npz')
     if (before := outcome_in(target)) is not None:
         return before
-    given = files.given(ml=True)
-    found = windows.judged(given, job.parameters)
+    given = files.input(ml=True)
+    found = tile_steps.judge_readings(given, job.parameters)
     own = given.readings.select(given.own)
     kinds, of = np.unique(np.stack([own.drive, own.sensor]), axis=1, return_inverse=True)
     marks = {'accepted': np.ones(len(own), np.bool_), 'no_echo': ~own.echo, 'unexplained': found.unexplained}

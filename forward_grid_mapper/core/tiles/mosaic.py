@@ -14,12 +14,12 @@ from ..common.readings import Readings
 from ..maps.traversed import traversed_cells
 from ..sensor.surface_normals import SurfaceNormals
 from .schedule import Schedule
+from .tile_steps import FinishedCore, JudgedReadings, SearchedWindow, TileInput, normals_from
 from .tiling import Tiling, boxes_of, widest_of
-from .windows import Finished, Given, Judged, Searched, normals_from
 
 T = TypeVar('T')
 
-Each = Callable[[Callable[[Given], T], Iterable[Given]], Iterable[T]]
+Each = Callable[[Callable[[TileInput], T], Iterable[TileInput]], Iterable[T]]
 """Calls a function with each item, in any order or in parallel, and returns the results in the order of the items:
 `map`, or that of an executor."""
 
@@ -79,18 +79,18 @@ class Mosaic:
     def _box(self, number: int, indices: NDArray[np.int64]) -> Grid:
         return self.tiling.box(number, self.readings.select(indices), self._parameters)
 
-    def given(self, number: int) -> Given:
+    def input_of(self, number: int) -> TileInput:
         """Return the input of a tile."""
-        return self._given(number, self._readings_of[number], self._boxes[number])
+        return self._input_of(number, self._readings_of[number], self._boxes[number])
 
-    def given_first(self, number: int) -> Given:
+    def first_input_of(self, number: int) -> TileInput:
         """Return the input of a tile for its first map, which is made without its neighbours."""
         indices = self._first_readings[number]
-        return self._given(number, indices, self._box(number, indices))
+        return self._input_of(number, indices, self._box(number, indices))
 
-    def _given(self, number: int, indices: NDArray[np.int64], box: Grid) -> Given:
+    def _input_of(self, number: int, indices: NDArray[np.int64], box: Grid) -> TileInput:
         part = self.grid.window(box)
-        return Given(
+        return TileInput(
             self.tiling.tiles[number],
             box,
             self.readings.select(indices),
@@ -108,26 +108,26 @@ class Mosaic:
         """Return the normals of the whole map."""
         return normals_from(self.normals, self._parameters)
 
-    def take_normals(self, number: int, normals: NDArray[np.float32]) -> None:
+    def store_normals(self, number: int, normals: NDArray[np.float32]) -> None:
         """Store the normals of a core."""
         self.normals[(slice(None), *self._core(number))] = normals
 
-    def take_first(self, number: int, found: Searched) -> None:
+    def store_first(self, number: int, found: SearchedWindow) -> None:
         """Store the core of a first map."""
         tile = self.tiling.tiles[number]
         self.occupied[self._core(number)] = found.occupied[tile.window.window(tile.core)]
 
-    def take(self, number: int, found: Searched) -> None:
+    def store_window(self, number: int, found: SearchedWindow) -> None:
         """Store the map of a window; tiles whose boxes contain changes become stale."""
         self.occupied[self.grid.window(self.tiling.tiles[number].window)] = found.occupied
         self.schedule.searched(number, found.changed)
 
-    def take_finished(self, number: int, found: Finished) -> None:
+    def store_finished(self, number: int, found: FinishedCore) -> None:
         """Store the final maps of a core."""
         core = self._core(number)
         self.ml[core], self.uncertainty[core], self.searched[core] = found.ml, found.uncertainty, found.searched
 
-    def take_judged(self, number: int, found: Judged) -> None:
+    def store_judged(self, number: int, found: JudgedReadings) -> None:
         """Store the results for the own readings of a tile."""
         indices = self._readings_of[number]
         own = indices[self._owner[indices] == number]

@@ -23,7 +23,7 @@ from ..common.parameters import Parameters
 from ..common.readings import Readings
 from ..sensor.cone_table import effective_sigma, grid_of, reach_of
 
-ROUND = max(LONGEST_GAP, SHORT_WALL)
+AROUND_WINDOW = max(LONGEST_GAP, SHORT_WALL)
 """Metres around a window that its moves depend on, besides the readings: the other end of a gap, or the rest of a short
 wall. The prior depends on `NEIGHBOURS_AWAY` more cells."""
 
@@ -69,7 +69,7 @@ class Tiling:
         self.grid = grid
         self._edge = edge_of(size, grid.resolution)
         self._margin = margin(grid.resolution)
-        self._around = math.ceil(ROUND / grid.resolution) + NEIGHBOURS_AWAY
+        self._around = math.ceil(AROUND_WINDOW / grid.resolution) + NEIGHBOURS_AWAY
         rows = range(grid.row // self._edge, (grid.row + grid.height - 1) // self._edge + 1)
         columns = range(grid.column // self._edge, (grid.column + grid.width - 1) // self._edge + 1)
         self._corner, self._across = (rows[0], columns[0]), len(columns)

@@ -27,7 +27,7 @@ from forward_grid_mapper.core.maps.traversed import traversed_cells
 from forward_grid_mapper.core.search.prior import log_prior, prior_gains, wall_prior
 from forward_grid_mapper.core.search.search import LEAST_GAIN, ROUNDING, Search
 from forward_grid_mapper.core.tiled_mapping import TiledMapper
-from forward_grid_mapper.core.tiles import windows
+from forward_grid_mapper.core.tiles import tile_steps
 from forward_grid_mapper.core.tiles.mosaic import Mosaic
 from forward_grid_mapper.core.tiles.tiling import Tiling, boxes_of, common_part, widest_of
 from forward_grid_mapper.simulation.drive import corridor_drive, drive
@@ -57,7 +57,7 @@ def mosaic(readings: Readings, parameters: Parameters, size: float) -> Mosaic:
 
 def with_normals(made: Mosaic, parameters: Parameters) -> Mosaic:
     for number in made.filled:
-        made.take_normals(number, windows.found_normals(made.given(number), parameters))
+        made.store_normals(number, tile_steps.estimate_normals(made.input_of(number), parameters))
     return made
 
 
@@ -118,17 +118,17 @@ def test_normals_evidence_and_maps_of_cores_equal_those_of_the_whole(size: float
     evidence.extend(made.readings)
     total = evidence.state.maps.evidence.reshape(maps.grid.shape)
     for number in made.filled:
-        around = made.given(number)
-        own = windows._evidence(around, p).state.maps.evidence.reshape(around.box.shape)
+        around = made.input_of(number)
+        own = tile_steps._evidence(around, p).state.maps.evidence.reshape(around.box.shape)
         window = around.tile.window
         np.testing.assert_array_equal(own[around.box.window(window)], total[maps.grid.window(window)])
     searched = 0.0
     for number in range(len(made.tiling.tiles)):
-        done = windows.finished(made.given(number), p)
-        made.take_finished(number, done)
+        done = tile_steps.finish_core(made.input_of(number), p)
+        made.store_finished(number, done)
         searched += done.log_likelihood
     for number in made.filled:
-        made.take_judged(number, windows.judged(made.given(number), p))
+        made.store_judged(number, tile_steps.judge_readings(made.input_of(number), p))
     made.dynamic[made.ml != 0] = 0
     for name in ('ml', 'uncertainty', 'searched', 'unexplained', 'dynamic'):
         np.testing.assert_array_equal(getattr(made, name), getattr(maps, name), name)
@@ -249,8 +249,8 @@ def test_surroundings_of_a_tile_can_be_pickled() -> None:
     p = Parameters()
     made = with_normals(mosaic(tour(), p, 4.0), p)
     number = made.filled[len(made.filled) // 2]
-    around = made.given(number)
-    job = pickle.loads(pickle.dumps(partial(windows.first_map, parameters=p)))
+    around = made.input_of(number)
+    job = pickle.loads(pickle.dumps(partial(tile_steps.search_alone, parameters=p)))
     sent = pickle.loads(pickle.dumps(around))
-    np.testing.assert_array_equal(job(sent).occupied, windows.first_map(around, p).occupied)
+    np.testing.assert_array_equal(job(sent).occupied, tile_steps.search_alone(around, p).occupied)
     assert dataclasses.asdict(sent.readings).keys() == dataclasses.asdict(around.readings).keys()

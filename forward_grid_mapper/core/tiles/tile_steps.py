@@ -1,6 +1,6 @@
 """Work on a single tile: functions of its readings and of the map around it, which any process may run.
 
-Each takes a `Given` and returns arrays of the core of the tile, or of its window if the search may change that.
+Each takes a `TileInput` and returns arrays of the core of the tile, or of its window if the search may change that.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from ..sensor.surface_normals import SurfaceNormals, gather, known_normals, no_n
 from .tiling import Tile
 
 
-class Given(NamedTuple):
+class TileInput(NamedTuple):
     """The input for the work on a tile.
 
     Attributes
@@ -70,7 +70,7 @@ def normals_from(xy: NDArray[np.float32], parameters: Parameters) -> SurfaceNorm
     return known_normals(((x != 0) | (y != 0)).astype(np.uint8), x, y, parameters.model.max_incidence_angle)
 
 
-class Searched(NamedTuple):
+class SearchedWindow(NamedTuple):
     """The map of a window after a search, and the part of the lattice that changed, or None."""
 
     occupied: NDArray[np.uint8]
@@ -79,7 +79,7 @@ class Searched(NamedTuple):
     converged: bool
 
 
-class Finished(NamedTuple):
+class FinishedCore(NamedTuple):
     """The final maps of a core, and sums over the own readings of the tile."""
 
     ml: NDArray[np.int8]
@@ -91,7 +91,7 @@ class Finished(NamedTuple):
     unstored: int
 
 
-class Judged(NamedTuple):
+class JudgedReadings(NamedTuple):
     """The evaluation of the own readings of a tile on the final map."""
 
     log_likelihood: NDArray[np.float64]
@@ -100,7 +100,7 @@ class Judged(NamedTuple):
     forward: ForwardModel
 
 
-def found_normals(given: Given, parameters: Parameters) -> NDArray[np.float32]:
+def estimate_normals(given: TileInput, parameters: Parameters) -> NDArray[np.float32]:
     """Return x and y of the surface normals of the core (`SurfaceNormals`), float32, shape (2, *core.shape)."""
     box = given.box
     if not has_limit(parameters.model):
@@ -115,7 +115,7 @@ def found_normals(given: Given, parameters: Parameters) -> NDArray[np.float32]:
     return np.stack([given.core(normals.x), given.core(normals.y)])
 
 
-def _evidence(given: Given, parameters: Parameters) -> Evidence:
+def _evidence(given: TileInput, parameters: Parameters) -> Evidence:
     threads = parameters.search.threads or 1
     memory = memory_for_pairs(parameters)
     normals = normals_from(given.normals, parameters)
@@ -134,7 +134,7 @@ def _filled_part(mask: NDArray[np.bool_], window: Grid) -> Grid | None:
     return Grid(window.resolution, window.column + columns[0], window.row + rows[0], width, height)
 
 
-def first_map(given: Given, parameters: Parameters) -> Searched:
+def search_alone(given: TileInput, parameters: Parameters) -> SearchedWindow:
     """Search the whole box from the empty map, and return the part of the window.
 
     Cells outside of the window lack some of their readings; they only help to explain the readings of the window.
@@ -144,10 +144,10 @@ def first_map(given: Given, parameters: Parameters) -> Searched:
     found = Search(evidence, parameters.search, given.traversed.ravel()).run()
     occupied = evidence.state.maps.occupied.reshape(given.box.shape)
     part = np.array(occupied[given.box.window(given.tile.window)])
-    return Searched(part, _filled_part(part != 0, given.tile.window), found.progress, found.converged)
+    return SearchedWindow(part, _filled_part(part != 0, given.tile.window), found.progress, found.converged)
 
 
-def improved(given: Given, parameters: Parameters) -> Searched:
+def search_with_neighbours(given: TileInput, parameters: Parameters) -> SearchedWindow:
     """Search the window, with the rest of the box fixed, until nothing gains."""
     evidence = _evidence(given, parameters)
     rows, columns = given.box.window(given.tile.window)
@@ -158,16 +158,16 @@ def improved(given: Given, parameters: Parameters) -> Searched:
     after = evidence.state.maps.occupied
     part = np.array(after.reshape(given.box.shape)[rows, columns])
     changed = (after != before).reshape(given.box.shape)[rows, columns]
-    return Searched(part, _filled_part(changed, given.tile.window), found.progress, found.converged)
+    return SearchedWindow(part, _filled_part(changed, given.tile.window), found.progress, found.converged)
 
 
-def finished(given: Given, parameters: Parameters) -> Finished:
+def finish_core(given: TileInput, parameters: Parameters) -> FinishedCore:
     """Return the final maps of the core from the map that the search found."""
     p = parameters
     evidence = _evidence(given, p)
     searched = evidence.observed()
     ml, uncertainty = final_maps(evidence, p.search, given.traversed)
-    return Finished(
+    return FinishedCore(
         given.core(ml),
         given.core(uncertainty),
         given.core(searched),
@@ -178,10 +178,10 @@ def finished(given: Given, parameters: Parameters) -> Finished:
     )
 
 
-def judged(given: Given, parameters: Parameters) -> Judged:
+def judge_readings(given: TileInput, parameters: Parameters) -> JudgedReadings:
     """Evaluate the own readings of the tile on the final map."""
     own = given.readings.select(given.own)
     forward = ForwardModel(own, given.box, parameters.model, normals_from(given.normals, parameters))
     e = forward.expectations(given.ml)
     unexplained = e.random > 0.5
-    return Judged(e.log_likelihood, unexplained, dynamic_echoes(forward, unexplained, given.ml), forward)
+    return JudgedReadings(e.log_likelihood, unexplained, dynamic_echoes(forward, unexplained, given.ml), forward)
