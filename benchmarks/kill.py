@@ -50,7 +50,8 @@ from std_srvs.srv import Trigger
 from forward_grid_mapper.core.common.errors import BagError
 from forward_grid_mapper.files.journal import drive_file, drives
 from forward_grid_mapper.files.journal_format import APPLICATION, ROW, TABLES, VERSION, Contents
-from forward_grid_mapper.files.journal_reader import log_of, read
+from forward_grid_mapper.files.journal_opening import log_of
+from forward_grid_mapper.files.journal_reader import read
 
 SECOND = 1_000_000_000
 START = 600

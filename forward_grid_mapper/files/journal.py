@@ -27,9 +27,10 @@ from typing import Any
 from ..core.common.errors import BagError, OutputError
 from ..core.common.readings import Readings
 from .journal_backlog import Backlog, Copied, Everything, Item, StoppedError
-from .journal_database import FULL, Drive, DriveWriter, FolderLock, GoneError, following, number_of
+from .journal_database import FULL, DriveFile, DriveWriter, FolderLock, LostFileError, next_file, number_of
 from .journal_format import DRIVE, OWN, Contents, Insert, encoded, path_rows, reading_rows
-from .journal_reader import is_journal, one_line, read_earlier
+from .journal_opening import one_line
+from .journal_reader import is_journal, read_earlier
 from .output_folder import expanded, output_errors
 from .syncing import Syncer
 
@@ -125,7 +126,7 @@ class Journal:
                 raise
         self._writer = DriveWriter(self._lock)
         self._source = found[-1] if found else None
-        self._drive = Drive(self._source or self.folder / 'drive_0001.journal', made=bool(found))
+        self._drive = DriveFile(self._source or self.folder / 'drive_0001.journal', made=bool(found))
         self._numbers: dict[str, int] = {}
         self._stated: tuple[Any, ...] = ()
         self._next = self._next_points = self._copied = 0
@@ -173,7 +174,7 @@ class Journal:
                 return
             if source is not None:
                 contents.continues = source.name
-                self._drive = Drive(following(source), continues=source.name)
+                self._drive = DriveFile(next_file(source), continues=source.name)
                 self._next = self._next_points = OWN
             self._work_in_background()
             # the file must exist before the first reading
@@ -256,7 +257,7 @@ class Journal:
             self._wake.notify_all()
             thread, syncer = self._thread, self._syncer
         if thread is None or syncer is None:
-            self._let_go()
+            self._unlock()
             return
         # it unlocks the folder, now or when the disk has finished
         thread.join(seconds)
@@ -270,7 +271,7 @@ class Journal:
                 # rows for a file that will not return
                 self._backlog.drop(self._drive)
             self._drive.head = self._names()
-            self._drive = Drive(following(self._drive.path), continues=continues)
+            self._drive = DriveFile(next_file(self._drive.path), continues=continues)
         self._numbers, self._stated = {}, ()
         self._next = self._next_points = OWN if continues else 0
         self._queue((), 0, 0)
@@ -319,7 +320,7 @@ class Journal:
         with self._wake:
             self._wake.wait_for(lambda: condition() or self.trouble or self._closing, PATIENCE)
 
-    def _let_go(self) -> None:
+    def _unlock(self) -> None:
         """Unlock the folder."""
         self._writer.end()
         self._lock.release()
@@ -337,14 +338,18 @@ class Journal:
                     self._write(items)
                 else:
                     self._writer.check_file()
-                    self._steady()
-            except GoneError as error:
+                    self._end_trouble()
+            except LostFileError as error:
                 self._give_up_file(error.drive, str(error))
             except Exception as error:
                 # of any class: the thread must not end silently
-                if not self._smaller(items) and not self._put_off(items, error) and self._failed(error):
+                if (
+                    not self._try_less_at_once(items)
+                    and not self._leave_copy_to_next_start(items, error)
+                    and self._report_failure(error)
+                ):
                     break
-        self._let_go()
+        self._unlock()
         syncer.close(0.0)
 
     def _write(self, items: list[Item]) -> None:
@@ -364,16 +369,16 @@ class Journal:
         drive = self._drive
         only_there = self._copied and drive.continues and not drive.gone
         if only_there and not os.path.lexists(drive.path.with_name(drive.continues)):
-            raise GoneError(drive, f'{drive.continues}, which it continues, was removed')
+            raise LostFileError(drive, f'{drive.continues}, which it continues, was removed')
 
-    def _steady(self) -> None:
+    def _end_trouble(self) -> None:
         """End the trouble if nothing has failed for a while."""
         with self._wake:
             if self.trouble and not self._backlog and time.monotonic() >= self._last_failed + STEADY:
                 self._warn(f'journal {self.path}: writing works again')
                 self.trouble = ''
 
-    def _give_up_file(self, drive: Drive, why: str) -> None:
+    def _give_up_file(self, drive: DriveFile, why: str) -> None:
         """Write no more to a file that vanished or was damaged, and have a new one made.
 
         For the current drive, `renew` makes it: only the node has the readings that were in the old one.
@@ -384,14 +389,14 @@ class Journal:
                 drive.gone = True
             else:
                 # an earlier drive: its remaining rows go to a new file, which begins with `head`
-                drive.path, drive.made, drive.next = following(drive.path), False, 0
+                drive.path, drive.made, drive.next = next_file(drive.path), False, 0
 
-    def _smaller(self, items: list[Item]) -> bool:
+    def _try_less_at_once(self, items: list[Item]) -> bool:
         """Return whether to try again at once with less."""
         with self._wake:
             return bool(items) and self._backlog.halve(items)
 
-    def _put_off(self, items: list[Item], error: Exception) -> bool:
+    def _leave_copy_to_next_start(self, items: list[Item], error: Exception) -> bool:
         """Leave a failed copy to the next start, so that new readings do not wait for it; return whether it was one."""
         rows = items[0].rows if items else None
         if not isinstance(rows, Copied):
@@ -407,7 +412,7 @@ class Journal:
             self._wake.notify_all()
         return True
 
-    def _failed(self, error: Exception) -> bool:
+    def _report_failure(self, error: Exception) -> bool:
         """Report a failed write, and wait before the next attempt; return whether to give up."""
         trouble = _words(error)
         if trouble != self.trouble:

@@ -13,7 +13,7 @@ from typing import NamedTuple
 
 from ..core.common.errors import BagError
 from ..core.common.readings import Readings
-from .journal_database import Drive
+from .journal_database import DriveFile
 from .journal_format import CONTINUES, ROW, Contents, Insert, path_rows, reading_rows
 from .journal_reader import read_earlier
 
@@ -33,7 +33,7 @@ class Item(NamedTuple):
     `readings` and `size` are their numbers of readings and bytes, `following` is the number of the next reading.
     """
 
-    drive: Drive
+    drive: DriveFile
     rows: Iterable[Insert]
     readings: int
     size: int
@@ -136,7 +136,7 @@ class Backlog:
         self.bytes += item.size
         self.readings += item.readings
 
-    def drop(self, drive: Drive) -> None:
+    def drop(self, drive: DriveFile) -> None:
         """Remove the items of a drive."""
         items, self._items = self._items, deque()
         self.bytes = self.readings = 0

@@ -20,7 +20,8 @@ from pathlib import Path
 from ..core.common.errors import BagError, OutputError
 from ..core.common.readings import Readings
 from .journal_format import APPLICATION, CONTINUES, DRIVE, ROW, TABLES, VERSION, Contents, Insert
-from .journal_reader import check, connect, extent, log_of, one_line, readings, unbounded
+from .journal_opening import connect, extent, log_of, one_line, unbounded
+from .journal_reader import check, readings
 
 PARTIAL = '.new.journal'
 """Name of a file before it is complete; an old one is overwritten."""
@@ -42,7 +43,7 @@ FULL = 'database or disk is full'
 
 
 @dataclass
-class Drive:
+class DriveFile:
     """A drive and its file.
 
     Attributes
@@ -69,12 +70,19 @@ class Drive:
     head: list[Insert] = field(default_factory=list)
 
 
-class GoneError(Exception):
-    """The file of a drive is not what was written to it; the message is the reason."""
+class LostFileError(Exception):
+    """The file of a drive, or one that it continues, is not what was written to it; the message is the reason.
 
-    def __init__(self, drive: Drive, why: str) -> None:
+    It cannot be continued: readings in memory must be written to a new file.
+    """
+
+    def __init__(self, drive: DriveFile, why: str) -> None:
         super().__init__(why)
         self.drive = drive
+
+
+class ClosedError(Exception):
+    """The journal was closed by another thread."""
 
 
 def number_of(path: Path) -> int:
@@ -83,7 +91,7 @@ def number_of(path: Path) -> int:
     return int(match[1]) if match else 0
 
 
-def following(path: Path) -> Path:
+def next_file(path: Path) -> Path:
     """Return the name of the journal file after `path`."""
     return path.with_name(f'drive_{number_of(path) + 1:04d}.journal')
 
@@ -147,13 +155,13 @@ class DriveWriter:
 
     Attributes
     ----------
-    drive : Drive or None
+    drive : DriveFile or None
         The drive whose file is open.
     """
 
     def __init__(self, lock: FolderLock) -> None:
         self._lock = lock
-        self.drive: Drive | None = None
+        self.drive: DriveFile | None = None
         self._database: sqlite3.Connection | None = None
         self._size = 0
         self._files: dict[Path, os.stat_result] = {}
@@ -162,7 +170,7 @@ class DriveWriter:
         self._opening = threading.Lock()
         self._ended = False
 
-    def resume(self, drive: Drive) -> bool:
+    def resume(self, drive: DriveFile) -> bool:
         """Open a file of an earlier run to continue it; return whether all of it is valid.
 
         Raises
@@ -185,7 +193,7 @@ class DriveWriter:
             if 'locked' in str(error):
                 self.close()
                 raise OutputError(f'{drive.path} is open in another program; close that first') from error
-        except (sqlite3.Error, MemoryError, OSError, BagError, GoneError):
+        except (sqlite3.Error, MemoryError, OSError, BagError, LostFileError, ClosedError):
             # its fault is found when it is read again
             pass
         self.close()
@@ -197,19 +205,19 @@ class DriveWriter:
         if database is not None:
             yield from readings(database, self._size, contents, earlier)
 
-    def write(self, drive: Drive, rows: Iterable[Insert], following: int) -> Path:
+    def write(self, drive: DriveFile, rows: Iterable[Insert], following: int) -> Path:
         """Commit rows to the file of a drive, which is created if needed; return SQLite's log, which contains them.
 
         Parameters
         ----------
-        drive : Drive
+        drive : DriveFile
         rows : iterable of (table, values)
         following : int
             Number of the first reading after them.
 
         Raises
         ------
-        GoneError
+        LostFileError
             If the file is not what was written to it.
         sqlite3.Error, OSError, OutputError
             If nothing can be written at the moment; no row was written.
@@ -229,7 +237,7 @@ class DriveWriter:
                 # opened again at the next attempt, and compared with the committed rows
                 self.close()
             if drive.made and (type(error) is sqlite3.DatabaseError or 'readonly' in str(error)):
-                raise GoneError(drive, one_line(error)) from error
+                raise LostFileError(drive, one_line(error)) from error
             raise
         except BaseException:
             self.close()
@@ -242,7 +250,7 @@ class DriveWriter:
             with suppress(sqlite3.Error):
                 self._database.execute('PRAGMA wal_checkpoint(TRUNCATE)')
             # the next check finds a file that vanished
-            with suppress(GoneError):
+            with suppress(LostFileError):
                 self._remember()
 
     def check_file(self) -> None:
@@ -250,14 +258,14 @@ class DriveWriter:
 
         Raises
         ------
-        GoneError
+        LostFileError
             If they are not.
         OSError
             If this cannot be checked.
         """
         try:
             self._check()
-        except GoneError:
+        except LostFileError:
             self.close()
             raise
 
@@ -286,26 +294,26 @@ class DriveWriter:
         with suppress(sqlite3.Error):
             database.close()
 
-    def _open(self, drive: Drive) -> None:
+    def _open(self, drive: DriveFile) -> None:
         if self._database is None or self.drive is not drive:
             self.close()
             if not drive.made:
                 self._make(drive)
             if not drive.path.exists():
-                raise GoneError(drive, 'it was deleted or moved')
+                raise LostFileError(drive, 'it was deleted or moved')
             try:
                 self._connect(drive)
             except BagError as error:
-                raise GoneError(drive, str(error)) from error
+                raise LostFileError(drive, str(error)) from error
             if self._next() < drive.next:
-                raise GoneError(drive, 'it contains less than was written to it')
+                raise LostFileError(drive, 'it contains less than was written to it')
         assert self._database is not None
         unbounded(self._database)
 
-    def _connect(self, drive: Drive) -> None:
+    def _connect(self, drive: DriveFile) -> None:
         with self._opening:
             if self._ended:
-                raise GoneError(drive, 'the journal was closed')
+                raise ClosedError('the journal was closed')
             self._size = extent(drive.path)
             database = connect(drive.path, 'mode=rw', self._size)
             try:
@@ -334,7 +342,7 @@ class DriveWriter:
             return True
         return False
 
-    def _make(self, drive: Drive) -> None:
+    def _make(self, drive: DriveFile) -> None:
         """Create the file of a drive under a hidden name, so that a file with the final name is always complete."""
         self._lock.renew()
         partial = [drive.path.with_name(PARTIAL + suffix) for suffix in ('', '-wal', '-journal')]
@@ -357,7 +365,7 @@ class DriveWriter:
         if any(path.exists() for path in partial[1:]):
             raise OSError(errno.EIO, 'a new file could not be completed')
         while os.path.lexists(drive.path):
-            drive.path = following(drive.path)
+            drive.path = next_file(drive.path)
         partial[0].rename(drive.path)
         drive.made = True
 
@@ -371,7 +379,7 @@ class DriveWriter:
                 # it exists from the first transaction on
                 self._files[log_of(path)] = log_of(path).stat()
         except FileNotFoundError:
-            raise GoneError(self.drive, f'{path.name} was deleted or moved') from None
+            raise LostFileError(self.drive, f'{path.name} was deleted or moved') from None
 
     def _check(self) -> None:
         for path, before in self._files.items():
@@ -379,8 +387,8 @@ class DriveWriter:
             try:
                 now = path.stat()
             except FileNotFoundError:
-                raise GoneError(self.drive, f'{path.name} was deleted or moved') from None
+                raise LostFileError(self.drive, f'{path.name} was deleted or moved') from None
             if not os.path.samestat(before, now):
-                raise GoneError(self.drive, f'{path.name} was replaced by another file')
+                raise LostFileError(self.drive, f'{path.name} was replaced by another file')
             if now.st_size < before.st_size:
-                raise GoneError(self.drive, f'{path.name} was truncated')
+                raise LostFileError(self.drive, f'{path.name} was truncated')

@@ -30,7 +30,8 @@ from forward_grid_mapper.files import journal_database, journal_reader, syncing
 from forward_grid_mapper.files.journal import Journal, drive_file, drives
 from forward_grid_mapper.files.journal_database import DriveWriter
 from forward_grid_mapper.files.journal_format import ROW, Contents
-from forward_grid_mapper.files.journal_reader import log_of, read
+from forward_grid_mapper.files.journal_opening import log_of
+from forward_grid_mapper.files.journal_reader import read
 
 KILLS = 10
 

@@ -22,7 +22,8 @@ from patience import PATIENCE, line_of
 from forward_grid_mapper.core.common.errors import BagError
 from forward_grid_mapper.files.journal import drive_file
 from forward_grid_mapper.files.journal_format import ROW, Contents
-from forward_grid_mapper.files.journal_reader import log_of, read
+from forward_grid_mapper.files.journal_opening import log_of
+from forward_grid_mapper.files.journal_reader import read
 
 FORGE = 'import sqlite3, sys; d = sqlite3.connect(sys.argv[1]); d.execute(sys.argv[2]); d.commit(); d.close()'
 
