@@ -15,7 +15,7 @@ from forward_grid_mapper.core.common.grid import Grid
 from forward_grid_mapper.core.common.parameters import Parameters
 from forward_grid_mapper.core.mapping import Mapper
 from forward_grid_mapper.files.figure import write_figure
-from forward_grid_mapper.files.panels import Tile
+from forward_grid_mapper.files.panels import FigureTile
 
 SHOWN = ('corridor 15°', 'office 15°', 'clutter 30°', 'office_a', 'office_b')
 MARGIN = 0.3
@@ -41,14 +41,14 @@ def _draw(path: Path, case: Case, base: dict[str, Any], paper: dict[str, Any], t
     standard = Standard(case, tool)
     gains = max(GAINS, key=standard.f1)
     grid, ml = standard.map(gains)
-    tiles = [Tile(_label('standard map, gains of the best F1', standard.figures(gains)), grid, ml)]
+    tiles = [FigureTile(_label('standard map, gains of the best F1', standard.figures(gains)), grid, ml)]
     for title, flat in (("paper's plain ML", paper), ('default', base)):
         maps = Mapper(Parameters().varied(flat)).run(case.readings)
-        tiles.append(Tile(_label(title, score(maps.ml, maps.grid, case, tool)), maps.grid, maps.ml))
-    tiles.append(Tile('default: probability of an obstacle', maps.grid, maps.uncertainty))
+        tiles.append(FigureTile(_label(title, score(maps.ml, maps.grid, case, tool)), maps.grid, maps.ml))
+    tiles.append(FigureTile('default: probability of an obstacle', maps.grid, maps.uncertainty))
     height, width = case.truth.shape
     column, row = (round(v / case.resolution) for v in case.origin)
-    truth = Tile('truth', Grid(case.resolution, column, row, width, height), case.truth)
+    truth = FigureTile('truth', Grid(case.resolution, column, row, width, height), case.truth)
     rows, columns = np.nonzero(case.truth > 0.5)
     left, right = case.origin[0] + case.resolution * np.array([columns.min(), columns.max() + 1])
     bottom, top = case.origin[1] + case.resolution * np.array([rows.min(), rows.max() + 1])

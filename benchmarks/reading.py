@@ -26,13 +26,13 @@ from forward_grid_mapper.core.common.parameters import Parameters
 from forward_grid_mapper.core.messages.batch_association import BatchAssociator
 from forward_grid_mapper.core.messages.message_types import range_message
 from forward_grid_mapper.core.messages.pose_association import PoseAssociator
-from forward_grid_mapper.recordings.bag_extrinsics import Extrinsics
+from forward_grid_mapper.recordings.bag_extrinsics import BagExtrinsics
 from forward_grid_mapper.simulation.campus import campus_drive
 
 
 def one_by_one(bag: Bag, topics: Topics) -> PoseAssociator:
     """Read a bag message by message."""
-    made = PoseAssociator(Extrinsics({}, bag.static_transforms(), StaticTransforms), Parameters(), patient=True)
+    made = PoseAssociator(BagExtrinsics({}, bag.static_transforms(), StaticTransforms), Parameters(), patient=True)
     for topic, message in bag.originals(topics):
         if topic in topics.range_topics:
             made.add_range(range_message(message))
@@ -44,7 +44,7 @@ def one_by_one(bag: Bag, topics: Topics) -> PoseAssociator:
 
 def at_once(bag: Bag, topics: Topics) -> PoseAssociator:
     """Read a bag many messages at once."""
-    made = BatchAssociator(Extrinsics({}, bag.static_transforms(), StaticTransforms), Parameters())
+    made = BatchAssociator(BagExtrinsics({}, bag.static_transforms(), StaticTransforms), Parameters())
     for batch in bag.batches(topics):
         made.add_batch(batch)
     made.finish()

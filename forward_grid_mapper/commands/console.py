@@ -21,7 +21,7 @@ from ..core.common.errors import MapperError
 from ..core.common.words import printable
 from ..core.runtime.compiling import compiling
 from ..core.search.search import Progress
-from .signals import Cancelled, Interruptible, cancelled_line
+from .signals import Interrupted, Interruptible, cancelled_line
 
 COMPILES = '(compiling kernels; this takes one to three minutes and is done once)'
 
@@ -61,7 +61,7 @@ def run(
     except OSError as error:
         # the work handles errors of its own files; others are those of the output or the working directory
         problem = _in_words(error) if _output_works() else f'standard output: {error.strerror or error}'
-    except Cancelled as cancelled:
+    except Interrupted as cancelled:
         # after SIGHUP there is no terminal
         with suppress(OSError):
             print(cancelled_line(parser.prog, cancelled.left), file=sys.stderr)

@@ -12,7 +12,7 @@ from ..core.mapping import Mapper
 from ..files.figure import write_figure
 from ..files.map_archive import MapArchive, read_npz
 from ..files.output_folder import free_name, output_errors, output_folder, readable
-from ..files.panels import Tile
+from ..files.panels import FigureTile
 from ..files.results import write_results
 from ..recordings.read_drive import read_drive
 from ..simulation.drive import Recording
@@ -137,10 +137,10 @@ def demo(options: argparse.Namespace) -> int:
         table = score_table(score_all(maps, recording), recording.world.doors)
         left, right, bottom, top = recording.world.grid.extent
         tiles = [
-            Tile('truth', recording.world.grid, recording.world.reference),
-            Tile('standard map', maps.grid, maps.live),
-            Tile('maximum likelihood map', maps.grid, maps.ml),
-            Tile('uncertainty map', maps.grid, maps.uncertainty),
+            FigureTile('truth', recording.world.grid, recording.world.reference),
+            FigureTile('standard map', maps.grid, maps.live),
+            FigureTile('maximum likelihood map', maps.grid, maps.ml),
+            FigureTile('uncertainty map', maps.grid, maps.uncertainty),
         ]
         rows = [tiles] if options.world == 'door' else [[tile] for tile in tiles]
         write_figure(folder / 'demo.png', f'The {options.world} world, simulated', rows, (left, right, bottom, top))

@@ -9,7 +9,7 @@ from ..core.common.parameters import Parameters
 from ..core.common.readings import Readings
 from ..core.sensor.density import hit_probability
 from ..core.sensor.forward_model import expectations
-from ..files.panels import Curve, Tile
+from ..files.panels import Curve, FigureTile
 
 NEAR, FAR, BESIDE = (1.5, 0.05), (2.6, -0.1), (2.0, 1.1)
 """Positions of the obstacles in the sensor's frame, metres: two in the cone, one beside it."""
@@ -19,7 +19,7 @@ HALF_ANGLE = np.radians(12.0)
 STEP = 0.005
 
 
-def density_of_ranges(parameters: Parameters) -> tuple[Curve, Tile]:
+def density_of_ranges(parameters: Parameters) -> tuple[Curve, FigureTile]:
     """Return p(z | m) for all ranges up to the largest, and the map with the cone of one reading.
 
     The likelihood is computed by the mapper's function, for each range.
@@ -35,7 +35,7 @@ def density_of_ranges(parameters: Parameters) -> tuple[Curve, Tile]:
     readings = Readings.from_columns(('sonar',), z=z, z_max=MAX_RANGE, half_angle=HALF_ANGLE, **same)
     found = expectations(readings, grid, occupied, parameters.model)
     cone = readings.select(slice(len(z) - 1, None))
-    return Curve(z, np.exp(found.log_likelihood)), Tile('the map and the cone', grid, occupied, cone)
+    return Curve(z, np.exp(found.log_likelihood)), FigureTile('the map and the cone', grid, occupied, cone)
 
 
 def density_table(curve: Curve, parameters: Parameters) -> str:

@@ -19,7 +19,7 @@ from ..core.trajectory.local_map import at_poses
 from ..core.trajectory.poses import compose, rms_after_alignment
 from ..core.trajectory.refinement import Refiner
 from ..core.trajectory.windows import Odometry
-from ..files.panels import Box, Tile
+from ..files.panels import Box, FigureTile
 from ..simulation.drift import LEVELS, odometry_of, with_drift
 from ..simulation.drive import Recording, corridor_drive, drive
 from ..simulation.score import SURFACE_DEPTH, score_map, visible_surface
@@ -45,7 +45,7 @@ WIDE = 2.6
 
 POSES = {'true': 'true poses', 'odometry': 'odometry', 'refined': 'refined'}
 
-Figure = tuple[list[list[Tile]], Box]
+Figure = tuple[list[list[FigureTile]], Box]
 """Rows of maps, and the box that they show."""
 
 
@@ -145,9 +145,9 @@ def one(exact: Recording, seed: int, parameters: Parameters) -> tuple[Figure, di
         rows[kind] = Row(ate, score_map(maps.ml, maps.grid, world, visible).f1, iou)
         ways[kind] = compose(home, path.pose)[:, :2]
         title = f'{POSES[kind]}: ATE {ate:.2f} m, F1 {rows[kind].f1:.2f}, IoU {iou:.2f}'
-        tiles.append(Tile(title, maps.grid, maps.ml, path_xy=ways[kind]))
+        tiles.append(FigureTile(title, maps.grid, maps.ml, path_xy=ways[kind]))
     tiles[2] = tiles[2]._replace(odometry_xy=ways['odometry'])
-    truth = Tile('truth', world.grid, world.reference, path_xy=ways['true'])
+    truth = FigureTile('truth', world.grid, world.reference, path_xy=ways['true'])
     view = box_of([*ways.values()], world.grid.extent)
     # the layout of figures: wide maps are stacked
     wide = (view[1] - view[0]) > WIDE * (view[3] - view[2])

@@ -14,7 +14,7 @@ from ..core.common.parameters import CONSTANTS, Parameters
 from ..core.common.words import counted
 from ..core.mapping import Mapper
 from ..core.maps.log_odds_map import LogOddsMap
-from ..files.panels import Tile
+from ..files.panels import FigureTile
 from ..simulation.drive import Recording, corridor_drive, door_drive, passing_drive
 from ..simulation.score import SURFACE_DEPTH, Mask, Scores, score_map, threshold, visible_surface
 from ..simulation.sonar import NOISE_FREE, NOISY
@@ -56,15 +56,15 @@ class Case(NamedTuple):
     visible: Mask
 
 
-class Outcome(NamedTuple):
+class MethodResult(NamedTuple):
     """The scores of one method over several recordings, and its maps of the first.
 
     `random` is the number of readings of each recording that a maximum likelihood map attributes to chance.
     """
 
     scores: list[Scores]
-    tile: Tile
-    uncertainty: Tile | None = None
+    tile: FigureTile
+    uncertainty: FigureTile | None = None
     random: tuple[int, ...] = ()
 
     @property
@@ -85,16 +85,16 @@ class Outcome(NamedTuple):
         return str(low) if low == high else f'{low}-{high}'
 
 
-def forward(cases: Iterable[Case], parameters: Parameters, title: str) -> Outcome:
+def forward(cases: Iterable[Case], parameters: Parameters, title: str) -> MethodResult:
     """Score the maximum likelihood map of every case."""
     scores, tiles, uncertain, random = [], [], [], []
     for case in cases:
         maps = Mapper(parameters).run(case.recording.readings)
         scores.append(score_map(maps.ml, maps.grid, case.recording.world, case.visible))
-        tiles.append(Tile(title, maps.grid, maps.ml))
-        uncertain.append(Tile(f'uncertainty map, {title}', maps.grid, maps.uncertainty))
+        tiles.append(FigureTile(title, maps.grid, maps.ml))
+        uncertain.append(FigureTile(f'uncertainty map, {title}', maps.grid, maps.uncertainty))
         random.append(int(np.count_nonzero(maps.unexplained)))
-    return Outcome(scores, tiles[0], uncertain[0], tuple(random))
+    return MethodResult(scores, tiles[0], uncertain[0], tuple(random))
 
 
 def standard_map(gains: dict[str, float]) -> LogOddsMap:
@@ -103,7 +103,7 @@ def standard_map(gains: dict[str, float]) -> LogOddsMap:
     return LogOddsMap(Parameters().varied({**values, **ONE_SUM}), (gains['depth'], gains['depth']))
 
 
-def standard(cases: Iterable[Case], gains: dict[str, float], title: str) -> Outcome:
+def standard(cases: Iterable[Case], gains: dict[str, float], title: str) -> MethodResult:
     """Score the standard map of every case."""
     scores, tiles = [], []
     for case in cases:
@@ -111,11 +111,11 @@ def standard(cases: Iterable[Case], gains: dict[str, float], title: str) -> Outc
         live.add(case.recording.readings)
         decided = threshold(live.probability())
         scores.append(score_map(decided, live.grid, case.recording.world, case.visible))
-        tiles.append(Tile(title, live.grid, decided))
-    return Outcome(scores, tiles[0])
+        tiles.append(FigureTile(title, live.grid, decided))
+    return MethodResult(scores, tiles[0])
 
 
-def best(outcomes: Iterable[Outcome], worth: Callable[[Outcome], float]) -> Outcome:
+def best(outcomes: Iterable[MethodResult], worth: Callable[[MethodResult], float]) -> MethodResult:
     """Return the outcome with the largest `worth`."""
     return max(outcomes, key=worth)
 
@@ -125,13 +125,13 @@ def seen(recording: Recording) -> Case:
     return Case(recording, visible_surface(recording.world, recording.readings, SURFACE_DEPTH))
 
 
-def raw_data(case: Case, title: str) -> Tile:
+def raw_data(case: Case, title: str) -> FigureTile:
     """Return the measured cones of a recording over the walls."""
     world = case.recording.world
-    return Tile(title, world.grid, np.where(world.reference == 1, 1.0, 0.0), case.recording.readings)
+    return FigureTile(title, world.grid, np.where(world.reference == 1, 1.0, 0.0), case.recording.readings)
 
 
-def door(options: argparse.Namespace, parameters: Parameters, ticker: Ticker) -> tuple[str, list[list[Tile]]]:
+def door(options: argparse.Namespace, parameters: Parameters, ticker: Ticker) -> tuple[str, list[list[FigureTile]]]:
     """Return table and figure of the experiment with a door that is seen n times."""
     lines = [
         'A 0.6 m door seen by n sweeps; F1 with one cell of tolerance, the open width of the door in metres',
@@ -164,7 +164,9 @@ def door(options: argparse.Namespace, parameters: Parameters, ticker: Ticker) ->
     return '\n'.join(lines), rows
 
 
-def passer_by(options: argparse.Namespace, parameters: Parameters, ticker: Ticker) -> tuple[str, list[list[Tile]]]:
+def passer_by(
+    options: argparse.Namespace, parameters: Parameters, ticker: Ticker
+) -> tuple[str, list[list[FigureTile]]]:
     """Return table and figure of the experiment with two doors on each side and a person who walks by."""
     cases = [seen(passing_drive(seed)) for seed in range(options.seeds)]
     ticker.say('the forward map')
@@ -200,12 +202,12 @@ def passer_by(options: argparse.Namespace, parameters: Parameters, ticker: Ticke
     return '\n'.join(lines), [[raw, top.tile, paper.tile], [mine, *filter(None, [ours.uncertainty])]]
 
 
-def fewest_doors(outcome: Outcome) -> int:
+def fewest_doors(outcome: MethodResult) -> int:
     """Return the smallest number of open doors of all recordings."""
     return min(s.doors_open for s in outcome.scores)
 
 
-def corridor(options: argparse.Namespace, parameters: Parameters, ticker: Ticker) -> tuple[str, list[list[Tile]]]:
+def corridor(options: argparse.Namespace, parameters: Parameters, ticker: Ticker) -> tuple[str, list[list[FigureTile]]]:
     """Return table and figure of the experiment with a long corridor."""
     cases = [seen(corridor_drive(seed)) for seed in range(options.seeds)]
     ticker.say('the forward map')
@@ -216,7 +218,7 @@ def corridor(options: argparse.Namespace, parameters: Parameters, ticker: Ticker
         ticker.say(f'the standard map, gains {k + 1} of {len(GAINS)}')
         tried.append(standard(cases[:SEEDS_OF_GAINS], gains, 'standard map'))
 
-    def wall(outcome: Outcome) -> float:
+    def wall(outcome: MethodResult) -> float:
         return float(np.mean([s.smooth_recall for s in outcome.scores]))
 
     top = best(tried, lambda outcome: outcome.f1)
@@ -247,6 +249,6 @@ def corridor(options: argparse.Namespace, parameters: Parameters, ticker: Ticker
         f'with an F1 of at least 0.80: {len(good)}.'
     )
     world = cases[0].recording.world
-    truth = Tile('truth, with the smooth wall marked', world.grid, world.reference, marked=world.smooth_cells)
+    truth = FigureTile('truth, with the smooth wall marked', world.grid, world.reference, marked=world.smooth_cells)
     tiles = [o.tile._replace(title=f'{name}, F1 {o.f1:.2f}, {fewest_doors(o)}/6 doors') for name, o in named.items()]
     return '\n'.join(lines), [[truth], *([tile] for tile in tiles)]

@@ -25,7 +25,7 @@ from ..recordings.drives import without_repetition
 from ..recordings.finding import find_recordings
 from .console import Ticker
 from .options import output_name
-from .signals import Cancelled
+from .signals import Interrupted
 
 TILE = 30.0
 """Edge of a tile without `--tiles`, metres."""
@@ -94,7 +94,7 @@ def with_workers(
     check_apart(output, work.root)
     # imported late: they need the extra
     from ..scale.cluster import Cluster
-    from ..scale.job import Job, Recordings, versions
+    from ..scale.job import DriveArguments, Job, versions
     from ..scale.mapping import ScaledMapper
     from ..scale.output import write_output
 
@@ -103,7 +103,7 @@ def with_workers(
     meant = find_recordings(options.bags)
     paths, repeated = without_repetition(meant.paths)
     of_all = dataclasses.replace(parameters, association=dataclasses.replace(parameters.association, max_readings=0))
-    recordings = Recordings(
+    recordings = DriveArguments(
         tuple(str(path.resolve()) for path in paths),
         extrinsics,
         tuple(options.range_topics) if options.range_topics else None,
@@ -134,7 +134,7 @@ def with_workers(
                     shutil.rmtree(work.root, ignore_errors=True)
                     raise
                 kept = f'finished work is kept in {readable(work.path)}; the same command continues from there'
-                if isinstance(error, Cancelled):
+                if isinstance(error, Interrupted):
                     error.left = f'no results were written, {kept}'
                 else:
                     print(kept, file=sys.stderr)

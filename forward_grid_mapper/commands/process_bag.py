@@ -32,7 +32,7 @@ from ..files.results import write_results
 from ..recordings.drive import jumps_note
 from ..recordings.drives import Drives, read_drives
 from ..recordings.journal_drive import poses_unused
-from ..recordings.refined import Given, refine_drives
+from ..recordings.refined import GivenCalibration, refine_drives
 from .console import Ticker, run
 from .desktop import show
 from .many_workers import add_worker_options, with_workers
@@ -186,9 +186,9 @@ def process(options: argparse.Namespace) -> int:
     return 0
 
 
-def _given(file: str | None) -> Given | None:
+def _given(file: str | None) -> GivenCalibration | None:
     """Return the calibration of a file, if given."""
-    return None if file is None else Given(load_calibration(file), readable(file))
+    return None if file is None else GivenCalibration(load_calibration(file), readable(file))
 
 
 def tell(options: argparse.Namespace, report: Mapping[str, Any], output: Path) -> None:

@@ -22,13 +22,13 @@ GRACE = 5.0
 and `ros2 launch` send Ctrl-C repeatedly."""
 
 AGAIN = 0.1
-"""Seconds before a signal is sent again if its `Cancelled` was lost."""
+"""Seconds before a signal is sent again if its `Interrupted` was lost."""
 
 ENDS_WITH_STDIN = 'FORWARD_GRID_MAPPER_ENDS_WITH_STDIN'
 """Environment variable: with the value 1 the process ends at the end of its standard input, which its parent holds."""
 
 
-class Cancelled(KeyboardInterrupt):
+class Interrupted(KeyboardInterrupt):
     """A signal that ends the work.
 
     Attributes
@@ -92,17 +92,17 @@ def output_closed() -> bool:
 
 
 class Interruptible:
-    """Lets a signal raise `Cancelled` in a `with` block, once within `GRACE`; for the main thread, no effect elsewhere.
+    """Lets a signal raise `Interrupted` in a `with` block, once within `GRACE`; only in the main thread.
 
     If C code calls Python, as the compiler of kernels does, an exception may be lost, or replaced by another one. Then
-    `Cancelled` is raised a little later, or instead of the other one.
+    `Interrupted` is raised a little later, or instead of the other one.
     """
 
     def __init__(self) -> None:
         self._before: dict[signal.Signals, Any] = {}
         self._first = -GRACE
         self._hook = sys.unraisablehook
-        self._lost: Cancelled | None = None
+        self._lost: Interrupted | None = None
         self._again: threading.Timer | None = None
 
     def __enter__(self) -> Interruptible:
@@ -124,17 +124,17 @@ class Interruptible:
             # code that handled the signal in the block may have set it to be ignored
             if signal.getsignal(number) is not signal.SIG_IGN:
                 signal.signal(number, handler)
-        if self._lost is not None and error is not None and not isinstance(error, Cancelled):
+        if self._lost is not None and error is not None and not isinstance(error, Interrupted):
             raise self._lost from None
 
     def _raise(self, number: int, frame: FrameType | None) -> None:
         now = time.monotonic()
         if now >= self._first + GRACE:
             self._first = now
-            raise Cancelled(number)
+            raise Interrupted(number)
 
     def _raise_later(self, lost: sys.UnraisableHookArgs) -> None:
-        if not isinstance(lost.exc_value, Cancelled):
+        if not isinstance(lost.exc_value, Interrupted):
             self._hook(lost)
             return
         self._lost, self._first = lost.exc_value, -GRACE

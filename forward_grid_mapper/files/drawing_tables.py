@@ -14,10 +14,12 @@ from matplotlib.patches import Wedge
 
 from ..core.common.readings import Readings
 from .drawing import BEFORE, CAPTION, DOT, DPI, EDGE, FRAME, GAP, HEAD, INK, UNKNOWN, WIDE, draw_map, draw_scale
-from .panels import PATH, Curve, Tile
+from .panels import PATH, Curve, FigureTile
 
 
-def draw_table(path: Path, title: str, rows: Sequence[Sequence[Tile]], view: tuple[float, float, float, float]) -> None:
+def draw_table(
+    path: Path, title: str, rows: Sequence[Sequence[FigureTile]], view: tuple[float, float, float, float]
+) -> None:
     """Write a table of maps, all in the box `view`, to `path`."""
     aspect = (view[1] - view[0]) / (view[3] - view[2])
     width = 3.0 if aspect < WIDE else 13.0
@@ -48,7 +50,7 @@ def draw_table(path: Path, title: str, rows: Sequence[Sequence[Tile]], view: tup
     figure.savefig(path)
 
 
-def draw_density(path: Path, title: str, tile: Tile, curve: Curve) -> None:
+def draw_density(path: Path, title: str, tile: FigureTile, curve: Curve) -> None:
     """Write a map with a cone, and the density below it on the same scale of metres, to `path`."""
     figure = Figure(figsize=(9.0, 8.8), dpi=DPI, facecolor='white')
     FigureCanvasAgg(figure)
@@ -76,7 +78,7 @@ def draw_density(path: Path, title: str, tile: Tile, curve: Curve) -> None:
     figure.savefig(path)
 
 
-def _draw_ways(axes: Axes, tile: Tile) -> None:
+def _draw_ways(axes: Axes, tile: FigureTile) -> None:
     if tile.odometry_xy is not None:
         axes.plot(*tile.odometry_xy.T, color=BEFORE, linewidth=1.1, linestyle=(0, (4, 2)), label='odometry')
     if tile.path_xy is not None:

@@ -8,10 +8,10 @@ from types import ModuleType
 
 from ..core.common.errors import OutputError
 from .output_folder import output_errors
-from .panels import Box, Curve, Tile
+from .panels import Box, Curve, FigureTile
 
 
-def write_figure(path: Path | str, title: str, rows: Sequence[Sequence[Tile]], view: Box) -> None:
+def write_figure(path: Path | str, title: str, rows: Sequence[Sequence[FigureTile]], view: Box) -> None:
     """Draw rows of maps of the same place, each with the box `view` (left, right, bottom, top in metres).
 
     Raises
@@ -24,7 +24,7 @@ def write_figure(path: Path | str, title: str, rows: Sequence[Sequence[Tile]], v
         _drawing().draw_table(path, title, rows, view)
 
 
-def write_density(path: Path | str, title: str, tile: Tile, curve: Curve) -> None:
+def write_density(path: Path | str, title: str, tile: FigureTile, curve: Curve) -> None:
     """Draw a map with a cone, and below it the density of the measured range.
 
     Raises

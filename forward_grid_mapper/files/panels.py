@@ -20,7 +20,7 @@ DRIVES = (PATH, '#009e73', '#e69f00', '#7b3294', '#56b4e9', '#8c510a', '#666666'
 """Colours of the paths of several drives; the first is that of a single drive; the same as in chart.js."""
 
 
-class Tile(NamedTuple):
+class FigureTile(NamedTuple):
     """One map of a table: `values` are probabilities, or cells 0 and 1, with NaN or -1 where unknown.
 
     The cones of `readings` are drawn over it, and the cells that are True in `marked` in the colour of dots. `path_xy`

@@ -26,7 +26,7 @@ MOST_OPTIONS = 8
 """Most sensors for which a message contains options to copy."""
 
 
-class Extrinsics:
+class BagExtrinsics:
     """Poses of the sensors on the robot: given by the user, or else by the bag's transforms.
 
     Attributes

@@ -25,7 +25,7 @@ from ..core.messages.pose_association import PoseAssociator
 from ..core.messages.rep117 import ODOMETRY_REASONS, REASONS, rejection_warnings, sensor_rejections
 from ..files.journal import drive_file
 from ..files.output_folder import readable
-from .bag_extrinsics import Extrinsics
+from .bag_extrinsics import BagExtrinsics
 from .drive import WHOLE, Drive, FullLiveMap, Part, Spans, alternation_note, length_of, thinning_note
 from .given_poses import GivenPoses
 from .journal_drive import read_journal
@@ -91,7 +91,7 @@ def read_drive(
         times = parameters.association
         parents = cache(partial(_parents, path))
         joints = partial(_moving_transforms, path, topics, parents, max(times.pose_timeout, times.max_pose_gap))
-        lookup = Extrinsics(extrinsics, bag.static_transforms(topics), constant, OtherBags(others, topics), joints)
+        lookup = BagExtrinsics(extrinsics, bag.static_transforms(topics), constant, OtherBags(others, topics), joints)
         associator = BatchAssociator(lookup, parameters, lookup.moves)
         live = FullLiveMap(associator, parameters)
         # a reading is placed by the poses before and after it
@@ -179,7 +179,7 @@ def _choosing(topics: Sequence[str]) -> str:
     return f'To use one of them, add `--range-topics {" ".join(map(quoted, topics))}`'
 
 
-def _warnings(bag: Bag, associator: PoseAssociator, lookup: Extrinsics) -> list[str]:
+def _warnings(bag: Bag, associator: PoseAssociator, lookup: BagExtrinsics) -> list[str]:
     warnings = []
     if bag.truncated:
         warnings.append(bag.truncated)
@@ -216,7 +216,7 @@ def _base_frame(bag: Bag) -> str:
 
 def _nothing_associated(
     associator: PoseAssociator,
-    lookup: Extrinsics,
+    lookup: BagExtrinsics,
     spans: Spans,
     undecodable: Mapping[str, int],
     poses: GivenPoses | None,

@@ -115,7 +115,7 @@ class RefinedDrives:
         return list(zip(self.drives.drives, self.odometry, self.outcomes, strict=True))
 
 
-class Given(NamedTuple):
+class GivenCalibration(NamedTuple):
     """A calibration of odometry, with the names of `core.trajectory.odometry_model`, and its file."""
 
     calibration: Mapping[str, float]
@@ -126,7 +126,7 @@ def refine_drives(
     drives: Drives,
     parameters: Parameters,
     watch: Watch = lambda stage, part: None,
-    given: Given | None = None,
+    given: GivenCalibration | None = None,
     refine: bool = True,
 ) -> RefinedDrives:
     """Return the drives with their trajectories, and add these to the report's data.
@@ -140,7 +140,7 @@ def refine_drives(
     parameters : Parameters
     watch : callable
         Receives the progress.
-    given : Given, optional
+    given : GivenCalibration, optional
         A calibration to apply to the odometry of all drives first.
     refine : bool
         Whether to refine; otherwise odometry with its calibration is the trajectory.
@@ -176,7 +176,7 @@ def _estimates(
     outcome: Refinement,
     parameters: Parameters,
     watch: Watch,
-    given: Given | None,
+    given: GivenCalibration | None,
 ) -> dict[str, Estimate]:
     if not outcome.accepted or not outcome.calibration:
         return {}
@@ -232,7 +232,7 @@ def odometry_of(drive: Drive) -> Odometry:
 
 
 def _outcome(
-    drive: Drive, odometry: Odometry, parameters: Parameters, watch: Watch, given: Given | None, refine: bool
+    drive: Drive, odometry: Odometry, parameters: Parameters, watch: Watch, given: GivenCalibration | None, refine: bool
 ) -> Refinement:
     readings = drive.associator.readings
     if drive.mounts is not None and not len(odometry.stamp):
@@ -250,7 +250,7 @@ def _outcome(
     return Refiner(parameters).run(readings, odometry, watch)
 
 
-def _calibrated(odometry: Odometry, given: Given) -> Odometry:
+def _calibrated(odometry: Odometry, given: GivenCalibration) -> Odometry:
     return calibrated(odometry, np.array([given.calibration.get(name, 0.0) for name in CALIBRATION]))
 
 

@@ -27,7 +27,7 @@ from .work_folder import WorkFolder, read_json
 
 
 @dataclass(frozen=True)
-class Recordings:
+class DriveArguments:
     """Arguments of `read_drive` for all drives."""
 
     paths: tuple[str, ...]

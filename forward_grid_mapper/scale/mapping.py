@@ -34,7 +34,7 @@ from ..files.quality_warning import NOT_CONVERGED
 from ..recordings.contradictions import Described, check_frames, contradictions
 from ..recordings.drives import same_drive, source_of_all, unreadable
 from .cluster import Cluster, Work
-from .job import Job, Recordings, plan_of
+from .job import DriveArguments, Job, plan_of
 from .placing import place
 from .tile_work import FIRST, finish, gather, judge, normals, search
 from .work_folder import write_json
@@ -43,7 +43,7 @@ Say = Callable[[str], None]
 
 
 @dataclass
-class Found:
+class JobResult:
     """The client's results; readings and maps are in the work folder.
 
     Attributes
@@ -92,7 +92,7 @@ class ScaledMapper:
         self._tasks: list[tuple[str, int, float, int]] = []
         self._peak = 0
 
-    def run(self, recordings: Recordings, repeated: Sequence[str] = ()) -> Found:
+    def run(self, recordings: DriveArguments, repeated: Sequence[str] = ()) -> JobResult:
         """Map drives; `repeated` are warnings about repeated ones.
 
         Raises
@@ -150,7 +150,7 @@ class ScaledMapper:
         self._seconds[stage] = self._seconds.get(stage, 0.0) + time.perf_counter() - begun
         return sorted(found, key=lambda one: one[0])
 
-    def _place(self, recordings: Recordings) -> dict[int, dict[str, Any]]:
+    def _place(self, recordings: DriveArguments) -> dict[int, dict[str, Any]]:
         """Place all drives; return the data of each."""
         result = dict(self._each('placing drives', place, range(len(recordings.paths)), recordings))
         errors: list[tuple[Path, MapperError]] = []
@@ -167,7 +167,7 @@ class ScaledMapper:
             known['source']['extrinsics'] = {frame: Pose2(*pose) for frame, pose in poses.items()}
         return result
 
-    def _plan(self, result: dict[int, dict[str, Any]], warnings: list[str]) -> Found:
+    def _plan(self, result: dict[int, dict[str, Any]], warnings: list[str]) -> JobResult:
         """Order the drives, leave out copies, and write the plan for the workers."""
         order = sorted(result, key=lambda k: (result[k]['first'], result[k]['digest'], result[k]['source']['bag']))
         described = {k: _described(result[k]) for k in order}
@@ -202,7 +202,7 @@ class ScaledMapper:
         write_json(self._job.folder.plan, plan)
         tiling = plan_of(self._job.folder, self._job.size).tiling
         paths = [np.array(result[k]['path'], np.float64).reshape(-1, 2) for k in kept]
-        return Found(tiling, source, tuple(names), joined_paths(paths))
+        return JobResult(tiling, source, tuple(names), joined_paths(paths))
 
     def _search(self, tiling: Tiling, boxes: dict[int, Grid]) -> dict[str, Any]:
         """Search until no tile changes; return counts. `boxes` has the tiles in the order of the first searches."""
@@ -229,7 +229,7 @@ class ScaledMapper:
             'searches_of_tiles': len(result),
         }
 
-    def _count(self, found: Found, judged: Sequence[dict[str, Any]]) -> None:
+    def _count(self, found: JobResult, judged: Sequence[dict[str, Any]]) -> None:
         """Add up counts of readings by drive and sensor, and of cells."""
         drives = len(found.source.get('drives') or (0,))
         counts = np.zeros((drives, len(found.sensor_names), 3), np.int64)

@@ -37,7 +37,7 @@ from ..files.png import write_png
 from ..files.report import json_text, report_data, write_report
 from .cluster import Cluster
 from .job import Job, plan_of, task
-from .mapping import Found, Say
+from .mapping import JobResult, Say
 from .work_folder import outcome_in, read_arrays
 
 MOST_CELLS_OF_A_FILE = 16_000_000
@@ -64,7 +64,7 @@ TITLES = {
 
 
 def write_output(
-    folder: Path, job: Job, found: Found, cluster: Cluster, parameters: Parameters, title: str, say: Say
+    folder: Path, job: Job, found: JobResult, cluster: Cluster, parameters: Parameters, title: str, say: Say
 ) -> dict[str, Any]:
     """Write maps, picture and report into a new folder; return the report.
 
@@ -101,7 +101,7 @@ def write_output(
     return report
 
 
-def _write_whole(folder: Path, job: Job, found: Found, parameters: Parameters) -> dict[str, NDArray[Any]]:
+def _write_whole(folder: Path, job: Job, found: JobResult, parameters: Parameters) -> dict[str, NDArray[Any]]:
     grid = found.tiling.grid
     maps = _map_set(found, parameters, layers_in(job, grid))
     write_raw(folder / 'live_map', grid, maps.live)
@@ -113,7 +113,7 @@ def _write_whole(folder: Path, job: Job, found: Found, parameters: Parameters) -
     return {'live_map': maps.live, 'ml_map': _shown(maps.ml), 'uncertainty_map': maps.uncertainty}
 
 
-def _map_set(found: Found, parameters: Parameters, layers: Mapping[str, NDArray[Any]]) -> MapSet:
+def _map_set(found: JobResult, parameters: Parameters, layers: Mapping[str, NDArray[Any]]) -> MapSet:
     """Return maps without readings, which are not in memory."""
     nothing = np.zeros(0)
     none = Readings.from_columns(x=nothing, y=nothing, yaw=nothing, z=nothing, z_max=nothing, half_angle=nothing)
@@ -191,7 +191,7 @@ def _regions(shape: tuple[int, int]) -> range:
 
 
 def _write_parts(
-    folder: Path, job: Job, found: Found, cluster: Cluster, say: Say
+    folder: Path, job: Job, found: JobResult, cluster: Cluster, say: Say
 ) -> tuple[dict[str, NDArray[Any]], int]:
     """Let workers write the parts; return the coarsest maps, and how many cells a side one of theirs has."""
     import zarr
@@ -291,7 +291,7 @@ def write_overview_of(job: Job, number: int, folder: str, level: int) -> dict[st
 # ---- the report
 
 
-def _report(found: Found, parameters: Parameters, warnings: list[str]) -> dict[str, Any]:
+def _report(found: JobResult, parameters: Parameters, warnings: list[str]) -> dict[str, Any]:
     empty = np.zeros((0, 0), np.float32)
     none: dict[str, NDArray[Any]] = {
         'live_map': empty,

@@ -20,7 +20,7 @@ from ..recordings.drive import jumps_note
 from ..recordings.drives import digest_of
 from ..recordings.journal_drive import poses_unused
 from ..recordings.read_drive import read_drive
-from .job import Job, Recordings, task
+from .job import DriveArguments, Job, task
 from .tables import columns_of, write_table
 from .work_folder import read_json, write_json
 
@@ -29,7 +29,7 @@ MOST_POINTS = 2000
 
 
 @task
-def place(job: Job, number: int, recordings: Recordings) -> dict[str, Any]:
+def place(job: Job, number: int, recordings: DriveArguments) -> dict[str, Any]:
     """Place the readings of a drive and divide them by tile; return the data of the drive.
 
     If a drive cannot be mapped, this is not yet an error of the job: `error` is returned, so that all such drives are

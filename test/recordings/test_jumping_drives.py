@@ -44,7 +44,7 @@ def test_errors_of_the_wheels_come_from_a_part_without_jumps(
     drive = drive_of('a')
     outcome = outcome_of(drive, stretch=stretch)
     odometry = Odometry.of(*drive.associator.odometry)
-    for given in (None, refined.Given({'scale': 0.0}, 'c.yaml')):
+    for given in (None, refined.GivenCalibration({'scale': 0.0}, 'c.yaml')):
         refined._estimates(drive, odometry, outcome, Parameters(), lambda stage, part: None, given)
     assert lengths == [[count] * 3] * 2
     nothing = Refinement(True, 'placed', drive.associator.readings, outcome.trajectory, {})

@@ -29,7 +29,7 @@ from forward_grid_mapper.files.map_archive import read_npz
 from forward_grid_mapper.files.map_files import read_map
 from forward_grid_mapper.recordings.drive import WHOLE
 from forward_grid_mapper.scale import extra
-from forward_grid_mapper.scale.job import Job, Recordings, check_versions, plan_of, versions
+from forward_grid_mapper.scale.job import DriveArguments, Job, check_versions, plan_of, versions
 from forward_grid_mapper.scale.work_folder import WorkFolder, whole
 from forward_grid_mapper.simulation.campus import campus_drive
 from forward_grid_mapper.simulation.sonar import front_array
@@ -96,9 +96,9 @@ def job_in(folder: Path, **values: Any) -> Job:
     return job
 
 
-def recordings(drives: Path, turned: bool = False) -> Recordings:
+def recordings(drives: Path, turned: bool = False) -> DriveArguments:
     paths = sorted(map(str, drives.iterdir()), reverse=turned)
-    return Recordings(tuple(paths), {}, None, None, WHOLE)
+    return DriveArguments(tuple(paths), {}, None, None, WHOLE)
 
 
 def assert_same(folder: Path, other: Path) -> None:
@@ -576,7 +576,7 @@ def test_drives_that_cannot_be_mapped_are_named(drives: Path, tmp_path: Path) ->
 
     paths = (*recordings(drives).paths, str(tmp_path / 'nothing'))
     with pytest.raises(Exception, match=r'1 of 4 drives cannot be mapped.*\n.*nothing'):
-        ScaledMapper(Here(), job_in(tmp_path / 'work')).run(Recordings(paths, {}, None, None, WHOLE))
+        ScaledMapper(Here(), job_in(tmp_path / 'work')).run(DriveArguments(paths, {}, None, None, WHOLE))
 
 
 @scaled
@@ -586,7 +586,7 @@ def test_bag_without_static_transforms_uses_those_of_another(drives: Path, tmp_p
     drive = dataclasses.replace(campus_drive(3, 1, 900, sonars=front_array()), extrinsics=())
     write_bag(tmp_path / 'without', drive, 'mcap', False)
     paths = (str(drives / 'drive_0'), str(tmp_path / 'without'))
-    placed = place(job_in(tmp_path / 'work'), 1, Recordings(paths, {}, None, None, WHOLE))
+    placed = place(job_in(tmp_path / 'work'), 1, DriveArguments(paths, {}, None, None, WHOLE))
     assert placed['source']['mounts_from'] == f'/tf_static of {paths[0]}'
 
 
