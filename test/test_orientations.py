@@ -12,7 +12,7 @@ from forward_grid_mapper.bags.static_transforms import StaticTransforms
 from forward_grid_mapper.core.common.errors import InputError
 from forward_grid_mapper.core.messages.extrinsics import Mount
 from forward_grid_mapper.core.messages.message_types import Pose2, odometry_message
-from forward_grid_mapper.node.frames import Extrinsics, Transforms
+from forward_grid_mapper.node.frames import TfExtrinsics, Transforms
 
 XYZW = tuple[float, float, float, float]
 
@@ -42,7 +42,7 @@ def by_tf(quaternion: XYZW, x: float = 1.0) -> Pose2 | None:
     translation, rotation = given(quaternion, x)
     found = SimpleNamespace(transform=SimpleNamespace(translation=translation, rotation=rotation))
     buffer = SimpleNamespace(lookup_transform=lambda *names: found)
-    pose = Extrinsics({}, Transforms(buffer))('base', 'sonar', 0)
+    pose = TfExtrinsics({}, Transforms(buffer))('base', 'sonar', 0)
     return pose if isinstance(pose, Pose2) else None
 
 

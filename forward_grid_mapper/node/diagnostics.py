@@ -116,7 +116,7 @@ class Health:
         nowhere = self._silence('frames without a pose', associator.rejected['unknown_extrinsics'])
         refused = sum(associator.odometry_rejected.values())
         # also messages that the associator has not processed yet
-        silent_odometry = self._silence('odometry', intake.odometry_came - refused)
+        silent_odometry = self._silence('odometry', intake.odometry_arrived - refused)
         refused_now, self._refused = refused - self._refused, refused
         stamp = associator.odometry_stamp or 0
         stuck = self._silence('stamp of odometry', stamp)
@@ -142,7 +142,7 @@ class Health:
                 f'odometry is received, but its stamp has been {stamp / NANOSECONDS:.3f} s for {stuck:.0f} s, so that '
                 'readings have no pose, or all the same; set header.stamp in its driver'
             )
-        if silent_ranges > max(SILENCE, intake.heard.patience):
+        if silent_ranges > max(SILENCE, intake.silence.patience):
             missing.append(f'no Range for {silent_ranges:.0f} s{absent("Range")}')
         without_pose = f'{NO_POSE}{listed(associator.unknown_frames)}' if associator.unknown_frames else ''
         if missing:

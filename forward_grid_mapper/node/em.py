@@ -31,18 +31,32 @@ from .refining import RefiningMapper
 
 @dataclass
 class Outcome:
-    """The result of a run: `maps`, or None with the reason in `message`.
+    """The result of a run.
 
-    `warnings` are faults of the readings, with those that `Run.inspect` found, which are in `drive` as well; `health`
-    is that of each sensor, `trajectory` describes the trajectory, `waited` is the time until kernels were compiled,
-    seconds. `replaced` is true if a call has replaced a run of the node itself.
+    Attributes
+    ----------
+    maps : MapSet or None
+    message : str
+        The reason if there are no maps.
+    trajectory : str
+        A description of the trajectory.
+    warnings : list of str
+        Faults of the readings, including `drive_faults`.
+    drive_faults : list of str
+        Those that `Run.find_faults` found.
+    replaced : bool
+        Whether a call has replaced a run of the node itself.
+    health : dict
+        The health of each sensor.
+    waited : float
+        Time until kernels were compiled, seconds.
     """
 
     maps: MapSet | None
     message: str
     trajectory: str = ''
     warnings: list[str] = field(default_factory=list)
-    drive: list[str] = field(default_factory=list)
+    drive_faults: list[str] = field(default_factory=list)
     replaced: bool = False
     health: dict[str, SensorHealth] = field(default_factory=dict)
     waited: float = 0.0
@@ -50,35 +64,60 @@ class Outcome:
 
 @dataclass
 class Run:
-    """One run of EM on the readings that `readings` returns, from the map `start` or from the empty one.
+    """One run of EM.
 
-    `stage` and `progress` are updated during the run. `found` is called with the maps once they are found, in the
-    thread. `shown` is true once an intermediate map was published, `moved` once its trajectory is the current one,
-    `end_requested` if cancel_em was called. `by_itself` is true if the node began the run and no call waits for it;
-    `fresh` returns whether the run uses all readings so far. `inspect` returns faults of the drive, and is called in
-    the thread. At its end, `own` are called with the outcome, the work of the node itself; then `waiting`, those who
-    wait for the run. `then` are those who wait for the run after it.
+    Attributes
+    ----------
+    mapper : Mapper or RefiningMapper
+    parameters : Parameters
+    readings : callable
+        Returns the readings of the run; called in the thread.
+    on_maps : callable
+        Called with the maps once they are made, in the thread.
+    start : tuple of Grid and int8, shape `grid.shape`, or None
+        The map to start from; None for the empty one.
+    begin : float
+        When it began, monotonic seconds.
+    stage, count, progress
+        Name of the current stage, number of readings, and state of the search; updated during the run.
+    cancelled : bool
+        Whether it was cancelled, for any reason.
+    cancel_requested : bool
+        Whether `cancel_em` was called.
+    map_shown : bool
+        Whether an intermediate map was published.
+    trajectory_adopted : bool
+        Whether its trajectory is the current one.
+    by_itself : bool
+        Whether the node began it, and no call waits for it.
+    uses_all_readings : callable
+        Returns whether the run uses all readings so far.
+    find_faults : callable
+        Returns faults of the drive; called in the thread.
+    at_end, callers, next_callers : list of callable
+        Called with the outcome: first `at_end`, the work of the node itself; then `callers`, the calls that wait for
+        this run. `next_callers` wait for the run after it.
     """
 
     mapper: Mapper | RefiningMapper
     parameters: Parameters
     readings: Callable[[], Readings]
-    found: Callable[[MapSet], object] = lambda maps: None
+    on_maps: Callable[[MapSet], object] = lambda maps: None
     start: tuple[Grid, NDArray[np.int8]] | None = None
     begin: float = field(default_factory=time.monotonic)
     stage: str = 'starting'
     count: int = 0
     progress: Progress | None = None
     cancelled: bool = False
-    shown: bool = False
-    moved: bool = False
-    end_requested: bool = False
+    map_shown: bool = False
+    trajectory_adopted: bool = False
+    cancel_requested: bool = False
     by_itself: bool = False
-    fresh: Callable[[], bool] = lambda: True
-    inspect: Callable[[], Iterable[str]] = tuple
-    then: list[Callable[[Outcome], object]] = field(default_factory=list)
-    own: list[Callable[[Outcome], object]] = field(default_factory=list)
-    waiting: list[Callable[[Outcome], object]] = field(default_factory=list)
+    uses_all_readings: Callable[[], bool] = lambda: True
+    find_faults: Callable[[], Iterable[str]] = tuple
+    next_callers: list[Callable[[Outcome], object]] = field(default_factory=list)
+    at_end: list[Callable[[Outcome], object]] = field(default_factory=list)
+    callers: list[Callable[[Outcome], object]] = field(default_factory=list)
 
     @property
     def seconds(self) -> float:
@@ -133,7 +172,7 @@ class EmWorker:
         """Begin a run, and return True; False if there is a current one. `done` is called first at its end."""
         if self.current is not None:
             return False
-        run.own.append(done)
+        run.at_end.append(done)
         self.current = run
         self.worker.put(lambda: self._work(run), lambda why: self._end(run, Outcome(None, f'EM failed: {why}')))
         return True
@@ -154,17 +193,17 @@ class EmWorker:
         """Do all work of a run; the worker reports unexpected exceptions."""
         outcome = self._outcome(run)
         if outcome.maps is not None:
-            run.found(outcome.maps)
+            run.on_maps(outcome.maps)
             run.stage, run.progress = 'judging sensors', None
-            self._judge(outcome, outcome.maps, run.inspect)
+            self._judge(outcome, outcome.maps, run.find_faults)
         self._end(run, outcome)
 
-    def _judge(self, outcome: Outcome, maps: MapSet, inspect: Callable[[], Iterable[str]]) -> None:
+    def _judge(self, outcome: Outcome, maps: MapSet, find_faults: Callable[[], Iterable[str]]) -> None:
         """Add the health of sensors and warnings; the maps are valid without them."""
         try:
             outcome.health = sensor_health(maps)
-            outcome.drive = list(inspect())
-            outcome.warnings = [*without_echoes(maps.readings), *input_warnings(maps.readings), *outcome.drive]
+            outcome.drive_faults = list(find_faults())
+            outcome.warnings = [*without_echoes(maps.readings), *input_warnings(maps.readings), *outcome.drive_faults]
         except Exception as error:
             outcome.warnings = [f'sensors could not be judged: {error!r}']
 
@@ -198,7 +237,7 @@ class EmWorker:
     def _end(self, run: Run, outcome: Outcome) -> None:
         def conclude() -> None:
             self.current = None
-            for done in itertools.chain(run.own, run.waiting):
+            for done in itertools.chain(run.at_end, run.callers):
                 try:
                     done(outcome)
                 except Exception as error:

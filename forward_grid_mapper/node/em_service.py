@@ -20,7 +20,7 @@ from .kernels import Kernels
 from .map_publishers import MapPublishers
 from .nothing_to_map import nothing_to_map
 from .online import OnlineWorker
-from .refining import Found, RefiningMapper
+from .refining import FoundTrajectory, RefiningMapper
 from .run_input import RunInput
 from .sensor_status import SensorWatch
 from .trajectory import Trajectory
@@ -52,9 +52,9 @@ class EmService:
     ----------
     maps : MapSet or None
         Of the latest run since the last reset.
-    found : Found or None
+    found_trajectory : FoundTrajectory or None
         Trajectory of the maps; None if none was estimated.
-    explained : int
+    accepted_at_run : int
         Number of readings that had been accepted when the run began.
     last_run : str
         How the last run ended.
@@ -88,8 +88,8 @@ class EmService:
         logger: Any,
     ) -> None:
         self.maps: MapSet | None = None
-        self.found: Found | None = None
-        self.explained = 0
+        self.found_trajectory: FoundTrajectory | None = None
+        self.accepted_at_run = 0
         self.last_run = 'none yet'
         self.wrong_input: list[str] = []
         self.drive_faults: list[str] = []
@@ -134,10 +134,10 @@ class EmService:
             self._logger.info('run_em waits for the compilation of kernels, as at the first start')
         if run is None:
             self._start(done)
-        elif run.by_itself and run.fresh() and not run.cancelled:
+        elif run.by_itself and run.uses_all_readings() and not run.cancelled:
             # it now has a caller
             run.by_itself = False
-            run.waiting.append(done)
+            run.callers.append(done)
         elif run.by_itself:
             self._replace(run, done)
         else:
@@ -149,7 +149,7 @@ class EmService:
             return False
         run = self._start()
         run.by_itself = True
-        run.own.append(lambda outcome: self._begin_replacement(run))
+        run.at_end.append(lambda outcome: self._begin_replacement(run))
         return True
 
     def _replace(self, run: Run, done: Callable[[Outcome], object]) -> None:
@@ -157,21 +157,21 @@ class EmService:
         run.by_itself = False
         if not run.cancelled:
             # callers that wait for it, such as save_maps, wait for the other one
-            run.then += run.waiting
-            run.waiting.clear()
-        run.then.append(done)
+            run.next_callers += run.callers
+            run.callers.clear()
+        run.next_callers.append(done)
         self.worker.cancel()
 
     def _begin_replacement(self, run: Run) -> None:
         """After a cancelled run, begin the run that replaces it, if any."""
-        if not run.then:
+        if not run.next_callers:
             return
         try:
-            self._start(*run.then)
+            self._start(*run.next_callers)
         except Exception as error:
-            _fail_all(run.then, f'EM cannot begin: {reason(error)}')
+            _fail_all(run.next_callers, f'EM cannot begin: {reason(error)}')
             raise
-        run.then.clear()
+        run.next_callers.clear()
 
     def cancel(self, reply: Reply) -> None:
         """Cancel the current run, keep readings and maps, and answer after its end."""
@@ -187,23 +187,23 @@ class EmService:
                 rest = 'were deleted' if outcome.message == BY_RESET else 'are kept'
                 reply.send(True, f'{outcome.message} (after {run.seconds:.1f} s); readings and earlier maps {rest}')
 
-        run.end_requested = True
-        run.waiting.append(ended)
-        _fail_all(run.then, 'EM was cancelled by cancel_em')
+        run.cancel_requested = True
+        run.callers.append(ended)
+        _fail_all(run.next_callers, 'EM was cancelled by cancel_em')
         self.worker.cancel()
 
     def when_there_are_maps(self, done: Callable[[Outcome], object]) -> None:
         """Have `done` called with the latest maps: at once, after the current run, or after a new run."""
         run = self.current
-        if run is not None and run.moved:
+        if run is not None and run.trajectory_adopted:
             # the live map is along its trajectory, the latest maps are not
-            run.waiting.append(done)
+            run.callers.append(done)
         elif self.maps is not None:
             done(Outcome(self.maps, ''))
         elif run is not None and not run.cancelled:
-            run.waiting.append(done)
-        elif run is not None and run.then:
-            run.then.append(done)
+            run.callers.append(done)
+        elif run is not None and run.next_callers:
+            run.next_callers.append(done)
         elif run is not None:
             done(Outcome(None, 'EM is being cancelled; call again when it has ended'))
         else:
@@ -213,9 +213,9 @@ class EmService:
         """Forget the maps, and cancel the current run."""
         self.worker.cancel()
         if self.current is not None:
-            _fail_all(self.current.then, BY_RESET)
+            _fail_all(self.current.next_callers, BY_RESET)
         self._generation = self._publishers.generation
-        self.maps, self.found, self.last_run = None, None, 'none since the reset'
+        self.maps, self.found_trajectory, self.last_run = None, None, 'none since the reset'
         self.wrong_input, self.drive_faults = [], []
         self.sensors.clear()
         self._consistency.forget()
@@ -230,8 +230,8 @@ class EmService:
         compiled = all(map(self._kernels.has, self._needed()))
         data = RunInput(self._associator, self._inbox, self.mounts(), compiled, lambda: run.cancelled)
 
-        def found(maps: MapSet) -> None:
-            if isinstance(mapper, RefiningMapper) or moved:
+        def on_maps(maps: MapSet) -> None:
+            if isinstance(mapper, RefiningMapper) or in_map_frame:
                 # the transform from the map frame changes together with the maps
                 self._inbox.put(lambda: self._show_moved(run, maps, data.accepted, generation))
             else:
@@ -248,23 +248,24 @@ class EmService:
                 self._keep(outcome, outcome.maps, data.accepted)
                 return
             self._report_failure(outcome)
-            if run.shown:
+            if run.map_shown:
                 self._publishers.publish('ml_map', generation, *before)
 
-        def inspect() -> list[str]:
+        def find_faults() -> list[str]:
             # with a refined trajectory, its own words say what became of jumps
-            refined = isinstance(mapper, RefiningMapper) and mapper.found and mapper.found.refinement
-            return [] if refined else jump_warnings(data.odometry)
+            found = mapper.found_trajectory if isinstance(mapper, RefiningMapper) else None
+            return [] if found and found.refinement else jump_warnings(data.odometry)
 
-        mapper, moved = self._trajectory.mapper(parameters, data.drive, data.drive_so_far), self._trajectory.on
+        mapper = self._trajectory.mapper(parameters, data.drive, data.drive_so_far)
+        in_map_frame = self._trajectory.in_map_frame
         start = self.online.so_far() if self.online and self._trajectory.correction is None else None
         # intermediate maps are shown meanwhile; if the run ends without a map, this one is published again
         before = self._publishers.ml_map
-        run = Run(mapper, parameters, data.readings, found, start, inspect=inspect)
-        run.fresh = lambda: data.fresh and parameters is self._parameters()
+        run = Run(mapper, parameters, data.readings, on_maps, start, find_faults=find_faults)
+        run.uses_all_readings = lambda: data.uses_all_readings and parameters is self._parameters()
         self._generation = generation
         self.worker.start(run, finish)
-        run.waiting.extend(callers)
+        run.callers.extend(callers)
         return run
 
     def _show(self, maps: MapSet, generation: int) -> None:
@@ -275,8 +276,9 @@ class EmService:
     def _show_moved(self, run: Run, maps: MapSet, count: int, generation: int) -> None:
         """Use the trajectory of a run, and publish its maps."""
         if generation == self._publishers.generation:
-            run.moved = True
-            self._trajectory.adopt(run.mapper.found if isinstance(run.mapper, RefiningMapper) else None, count)
+            run.trajectory_adopted = True
+            found = run.mapper.found_trajectory if isinstance(run.mapper, RefiningMapper) else None
+            self._trajectory.adopt(found, count)
             self._show(maps, generation)
 
     def _needed(self) -> tuple[str, ...]:
@@ -289,11 +291,11 @@ class EmService:
 
     def _why_no_maps(self, run: Run, data: RunInput) -> str:
         """Return the reason why a run ended without maps, if the run itself cannot know it; otherwise ''."""
-        if run.end_requested:
+        if run.cancel_requested:
             return 'EM was cancelled by cancel_em'
         if data.empty:
             return nothing_to_map(self._associator, self.range_topics, self.odom_topic, self.no_map_frame())
-        return REPLACED if run.then else ''
+        return REPLACED if run.next_callers else ''
 
     def _report_failure(self, outcome: Outcome) -> None:
         self.last_run = outcome.message
@@ -306,9 +308,9 @@ class EmService:
 
     def _keep(self, outcome: Outcome, maps: MapSet, count: int) -> None:
         """Keep the maps of a run, log its result, and begin the checks that take longer."""
-        self.maps, self.found, self.explained = maps, self._trajectory.found, count
+        self.maps, self.found_trajectory, self.accepted_at_run = maps, self._trajectory.found_trajectory, count
         outcome.warnings += self.clock_notes()
-        self.wrong_input, self.drive_faults = outcome.warnings, outcome.drive
+        self.wrong_input, self.drive_faults = outcome.warnings, outcome.drive_faults
         self.sensors.take(outcome.health)
         if self.online:
             self.online.adopt(maps)
@@ -347,5 +349,5 @@ class EmService:
             return
         self._logger.info(f'EM: {run}')
         if found := run.mapper.so_far():
-            run.shown = True
+            run.map_shown = True
             self._publishers.publish('ml_map', generation, *found)

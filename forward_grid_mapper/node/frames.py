@@ -27,7 +27,7 @@ KEPT = 30
 """Seconds of transforms that are kept, by stamps; with tf2's 10 s, those of a bag that is played ten times as fast are
 gone after a pause of a second."""
 
-MOST_HELD = 10_000
+MOST_UNTRANSFORMED = 10_000
 """Most odometry messages that wait for a transform."""
 
 LOOKUPS = 100
@@ -135,7 +135,7 @@ class Transforms:
         return stamp_of(found.header)
 
 
-class Extrinsics:
+class TfExtrinsics:
     """Poses of the sensors on the robot: parameters take precedence over TF."""
 
     def __init__(self, given: Mapping[str, Pose2], transforms: Transforms) -> None:
@@ -197,7 +197,7 @@ class MapFrame:
     def __init__(self, map_frame: str, transforms: Transforms, timeout: float) -> None:
         self._map_frame, self._transforms = map_frame, transforms
         self.timeout = timeout
-        self._held: deque[OdometryMessage] = deque()
+        self._untransformed: deque[OdometryMessage] = deque()
         self.dropped = 0
         self._lack: Later | None = None
         self._frame = ''
@@ -214,7 +214,7 @@ class MapFrame:
         if self._lack is None:
             return ''
         way = f'from {self._map_frame} (map_frame) to {self._frame}'
-        waiting = f'{len(self._held)} odometry messages wait for it, {self.dropped} were dropped'
+        waiting = f'{len(self._untransformed)} odometry messages wait for it, {self.dropped} were dropped'
         if self._lack is TILTED:
             what = 'is tilted, upside down or not finite, or its quaternion is not normalised'
             return f"TF's transform {way} {what}: {waiting}"
@@ -236,18 +236,19 @@ class MapFrame:
         if not self._map_frame or message.frame_id.lstrip('/') == self._map_frame.lstrip('/'):
             return [message]
         # the associator sorts messages that only overtook others; a stamp far ahead would block all others
-        while order != GOES_ON and self._held and (order == JUMPED_BACK or self._held[-1].stamp > message.stamp):
+        waiting = self._untransformed
+        while order != GOES_ON and waiting and (order == JUMPED_BACK or waiting[-1].stamp > message.stamp):
             self.dropped += 1
-            self._held.pop()
-        self._held.append(message)
+            waiting.pop()
+        self._untransformed.append(message)
         self._newest, self._frame = time.monotonic(), message.frame_id
-        if len(self._held) > MOST_HELD:
+        if len(self._untransformed) > MOST_UNTRANSFORMED:
             # messages with equal stamps never time out
-            self._held.popleft()
+            self._untransformed.popleft()
             self.dropped += 1
         ready = []
-        for _ in range(min(len(self._held), LOOKUPS)):
-            first = self._held[0]
+        for _ in range(min(len(self._untransformed), LOOKUPS)):
+            first = self._untransformed[0]
             transform = self._transforms.lookup(self._map_frame, first.frame_id, first.stamp)
             pose = None if isinstance(transform, Later) else planar_pose(transform.translation, transform.rotation)
             self._note(transform, pose is not None)
@@ -261,12 +262,12 @@ class MapFrame:
                 break
             else:
                 self.dropped += 1
-            self._held.popleft()
+            self._untransformed.popleft()
         return ready
 
     def forget(self) -> None:
         """Forget the messages that wait, and the number of those dropped."""
-        self._held.clear()
+        self._untransformed.clear()
         self.dropped = 0
 
     def _note(self, transform: Any | Later, planar: bool) -> None:

@@ -21,8 +21,8 @@ from ..core.messages.repeated_topics import RepeatedTopics
 from .clocks import Arrivals, OdometryClock, SensorClocks
 from .draining import Draining
 from .frames import MapFrame
-from .heard import Heard
 from .losses import LOSS_WARNING, Losses
+from .sensor_silence import SensorSilence
 
 QUEUE = 2000
 """Most messages that may wait for the node in the middleware, so that none is lost in a pause of a second."""
@@ -37,6 +37,23 @@ class _InMapFrame(NamedTuple):
     message: OdometryMessage
 
 
+class _Pending(NamedTuple):
+    """A message that waits for the associator.
+
+    Attributes
+    ----------
+    message : RangeMessage, OdometryMessage or _InMapFrame
+    sent : int
+        When it was published, nanoseconds of the system's clock, 0 if unknown.
+    paused : bool
+        Whether mapping was paused when it arrived.
+    """
+
+    message: RangeMessage | OdometryMessage | _InMapFrame
+    sent: int
+    paused: bool
+
+
 class Intake:
     """Receives messages, and holds them back while the associator is not ready.
 
@@ -47,9 +64,9 @@ class Intake:
         Whether QoS of ranges is reliable, so that lost messages are a fault.
     range_losses : list of Losses
         Of each Range topic.
-    heard : Heard
+    silence : SensorSilence
         The time of each sensor's last message.
-    odometry_came : int
+    odometry_arrived : int
         Odometry messages received, including waiting ones and those before a reset.
     """
 
@@ -76,14 +93,15 @@ class Intake:
         self._node, self._associator, self._map_frame, self._on_taken = node, associator, map_frame, on_taken
         self.paused = self._ready = False
         self.reliable = own.range_reliability == 'reliable'
-        self.heard = Heard()
+        self.silence = SensorSilence()
         self._repeated = RepeatedTopics()
         self._repeated_logged: set[str] = set()
         self._odometry_clock = OdometryClock(associator, node.get_logger().warning)
         self._sensor_clocks = SensorClocks(node.get_logger().warning)
         self._arrivals, self._odometry_arrivals = Arrivals(), Arrivals()
-        self._held: deque[tuple[RangeMessage | OdometryMessage | _InMapFrame, int, bool]] = deque()
-        self._ranges_held = self._refused = self._losses_logged = self.odometry_came = 0
+        # in the order of arrival
+        self._pending: deque[_Pending] = deque()
+        self._pending_ranges = self._refused_ranges = self._losses_logged = self.odometry_arrived = 0
         self._last_refused: RangeMessage | None = None
         self._next_warning = 0.0
         self._more = node.create_guard_condition(self.work)
@@ -124,7 +142,7 @@ class Intake:
             losses.begin_anew()
 
     def _forget_senders(self) -> None:
-        self.heard.clear()
+        self.silence.clear()
         self._odometry_clock.forget()
         self._sensor_clocks.clear()
         self._arrivals.clear()
@@ -151,12 +169,12 @@ class Intake:
     @property
     def received(self) -> int:
         """Number of Range messages received: accepted + waiting + rejected."""
-        return self._associator.received + self._ranges_held + self._refused
+        return self._associator.received + self._pending_ranges + self._refused_ranges
 
     @property
     def waiting(self) -> int:
         """Number of readings that wait, for a pose or for the associator."""
-        return self._associator.waiting + self._ranges_held
+        return self._associator.waiting + self._pending_ranges
 
     @property
     def lost(self) -> int:
@@ -237,28 +255,28 @@ class Intake:
         """Receive a Range."""
         made, sent = range_message(message), info['source_timestamp']
         losses.taken(info, made.frame_id, made.stamp)
-        self.heard.note(made.frame_id)
+        self.silence.note(made.frame_id)
         self._on_taken(sent)
         stamp = corrected(made.stamp, self._associator.parameters)
         self._sensor_clocks.note(made.frame_id, stamp, self._arrivals.of(made.frame_id, info))
-        if self._ready and not self._held and not self._associator.behind:
-            self._take(made, sent, self.paused)
-        elif self._ranges_held >= MOST_WAITING:
+        if self._ready and not self._pending and not self._associator.behind:
+            self._process(_Pending(made, sent, self.paused))
+        elif self._pending_ranges >= MOST_WAITING:
             self._refuse(made)
         else:
-            self._ranges_held += 1
+            self._pending_ranges += 1
             self._hold(made, sent)
         self._wake()
 
     def on_odometry(self, message: Odometry, info: dict[str, Any]) -> None:
         """Receive an Odometry."""
         made, sent = odometry_message(message), info['source_timestamp']
-        self.odometry_came += 1
+        self.odometry_arrived += 1
         self._odometry_losses.taken(info, made.frame_id, made.stamp)
         self._sensor_clocks.note_odometry(made.stamp, self._odometry_arrivals.of('odometry', info))
-        if self._ready and not self._held and not self._associator.behind:
-            self._take(made, sent, self.paused)
-        elif len(self._held) - self._ranges_held < MOST_WAITING:
+        if self._ready and not self._pending and not self._associator.behind:
+            self._process(_Pending(made, sent, self.paused))
+        elif len(self._pending) - self._pending_ranges < MOST_WAITING:
             self._hold(made, sent)
         else:
             self._odometry_losses.add(1)
@@ -268,8 +286,8 @@ class Intake:
         """Give the associator the messages held back, and later ones as they arrive."""
         self._ready = True
         if self._last_refused is not None:
-            self._associator.reject(self._last_refused, 'too_many_waiting', self._refused)
-            self._refused = 0
+            self._associator.reject(self._last_refused, 'too_many_waiting', self._refused_ranges)
+            self._refused_ranges = 0
         self._wake()
 
     def work(self) -> None:
@@ -283,15 +301,15 @@ class Intake:
             if self._associator.behind:
                 self._associator.settle()
                 continue
-            message, sent, paused = self._held.popleft()
-            self._ranges_held -= isinstance(message, RangeMessage)
-            self._take(message, sent, paused)
+            pending = self._pending.popleft()
+            self._pending_ranges -= isinstance(pending.message, RangeMessage)
+            self._process(pending)
         self._wake()
 
     def forget(self) -> None:
         """Forget the messages held back, and all counts."""
-        self._held.clear()
-        self._ranges_held = 0
+        self._pending.clear()
+        self._pending_ranges = 0
         self._map_frame.forget()
         for losses in (*self.range_losses, self._odometry_losses):
             losses.clear()
@@ -304,10 +322,10 @@ class Intake:
     @property
     def busy(self) -> bool:
         """Whether work remains before the next message."""
-        return bool(self._held) or self._associator.behind
+        return bool(self._pending) or self._associator.behind
 
     def _hold(self, message: RangeMessage | OdometryMessage, sent: int) -> None:
-        self._held.append((message, sent, self.paused))
+        self._pending.append(_Pending(message, sent, self.paused))
 
     def _refuse(self, message: RangeMessage) -> None:
         if self._ready:
@@ -315,13 +333,15 @@ class Intake:
         else:
             # another thread uses the associator
             self._last_refused = message
-            self._refused += 1
+            self._refused_ranges += 1
 
-    def _take(self, message: RangeMessage | OdometryMessage | _InMapFrame, sent: int, paused: bool) -> None:
+    def _process(self, pending: _Pending) -> None:
+        """Give a message to the associator; odometry may first have to wait for the transform to the map frame."""
+        message, sent, paused = pending
         if isinstance(message, OdometryMessage):
             converted = self._map_frame.convert(message)
             # the others are processed in turn with the waiting messages
-            self._held.extendleft((_InMapFrame(other), sent, False) for other in reversed(converted[1:]))
+            self._pending.extendleft(_Pending(_InMapFrame(other), sent, False) for other in reversed(converted[1:]))
             if converted:
                 self._add_odometry(converted[0], sent)
         elif isinstance(message, _InMapFrame):

@@ -86,22 +86,22 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return 1
     # threads switch often, so that callbacks do not wait long for EM between two kernels
     sys.setswitchinterval(0.0005)
-    from . import complaints
+    from . import error_explanations
 
-    if wrong := complaints.of_domain(os.environ):
+    if wrong := error_explanations.explain_domain(os.environ):
         print(f'mapper: error: {wrong}', file=sys.stderr)
         return 1
     try:
         rclpy.init(args=['mapper', *arguments], signal_handler_options=SignalHandlerOptions.NO)
         left = remove_ros_args(['mapper', *arguments])[1:]
     except rclpy_implementation.UnknownROSArgsError as error:
-        print(f'mapper: error: {complaints.of_ros_arguments(str(error))}', file=sys.stderr)
+        print(f'mapper: error: {error_explanations.explain_ros_arguments(str(error))}', file=sys.stderr)
         return 2
     except Exception as error:  # rclpy raises classes of its C extension, for a parameter file with a fault for one
-        print(f'mapper: error: {complaints.of_ros(error)}', file=sys.stderr)
+        print(f'mapper: error: {error_explanations.explain_ros_error(error)}', file=sys.stderr)
         return 1
     if left:
-        print(f'mapper: error: {complaints.of_arguments(left)}\n{USAGE}', file=sys.stderr)
+        print(f'mapper: error: {error_explanations.explain_arguments(left)}\n{USAGE}', file=sys.stderr)
         return 2
     # imported here, since it takes a second, and a faulty command line is reported at once; numpy starts threads when
     # it is imported, and the signals must be blocked before
@@ -111,7 +111,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     node = executor = None
     try:
         node = MapperNode()
-        for text in complaints.of_sections(arguments, node.get_fully_qualified_name()):
+        for text in error_explanations.missing_section_warnings(arguments, node.get_fully_qualified_name()):
             node.get_logger().warning(text)
         executor = SingleThreadedExecutor()
         executor.add_node(node)
@@ -125,7 +125,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except _Stop:
         pass
     except (MapperError, NameValidationException, ValueError, rclpy_implementation.RCLError) as error:
-        wrong = str(error) if isinstance(error, MapperError) else complaints.of_ros(error)
+        wrong = str(error) if isinstance(error, MapperError) else error_explanations.explain_ros_error(error)
         print(f'mapper: error: {wrong}', file=sys.stderr)
         return 1
     finally:

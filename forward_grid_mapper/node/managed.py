@@ -10,7 +10,7 @@ from typing import Any
 from rosgraph_msgs.msg import Clock
 
 from ..core.common.errors import MapperError
-from .complaints import of_ros
+from .error_explanations import explain_ros_error
 
 try:
     from rclpy.lifecycle import LifecycleNode as Base
@@ -130,7 +130,7 @@ class ManagedNode(Base):
             self._refusal = error
             if not self._starting:
                 expected = isinstance(error, (MapperError, ValueError)) or type(error).__name__ == 'RCLError'
-                self.get_logger().error(of_ros(error) if expected else traceback.format_exc())
+                self.get_logger().error(explain_ros_error(error) if expected else traceback.format_exc())
             return TransitionCallbackReturn.FAILURE
 
     def _answered(self, change: Callable[[Any, Any], Any]) -> Callable[[Any, Any], Any]:
@@ -140,7 +140,7 @@ class ManagedNode(Base):
             try:
                 return change(request, response)
             except Exception as error:  # a class of rclpy's C extension
-                self.get_logger().warning(f'a transition was refused: {of_ros(error)}')
+                self.get_logger().warning(f'a transition was refused: {explain_ros_error(error)}')
                 response.success = False
                 return response
 

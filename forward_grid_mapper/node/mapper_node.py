@@ -24,13 +24,13 @@ from ..files.output_folder import unwritable
 from ..files.parameter_file import NODE_NAME
 from . import ros_parameters
 from .background import Inbox, Worker
-from .complaints import of_ros
 from .deferred import DeferredService, Reply, answered
 from .diagnostics import Health
 from .em_service import EmService
+from .error_explanations import explain_ros_error
 from .feeding import Feed
 from .following import Following
-from .frames import Extrinsics, MapFrame, Transforms
+from .frames import MapFrame, TfExtrinsics, Transforms
 from .intake import AT_ONCE, Intake
 from .journal_keeper import JournalKeeper
 from .kernels import Kernels
@@ -133,7 +133,7 @@ class MapperNode(ManagedNode):
         looked_up = '' if node.refine_poses else node.map_frame
         if looked_up and not transforms.available:
             raise MapperError(f'map_frame is {node.map_frame}, but tf2_ros is not installed to look it up')
-        self._transforms, self._extrinsics = transforms, Extrinsics(ros_parameters.mounts(self), transforms)
+        self._transforms, self._extrinsics = transforms, TfExtrinsics(ros_parameters.mounts(self), transforms)
         self._map_frame = MapFrame(looked_up, transforms, self.parameters.association.pose_timeout)
         self._poses_from = 'parameters and TF' if transforms.available else 'parameters (tf2_ros is not installed)'
 
@@ -146,7 +146,7 @@ class MapperNode(ManagedNode):
         self.trajectory = trajectory = Trajectory(self, self.associator, self._steady)
         self.maps = MapPublishers(self, self.parameters.grid.resolution, lambda: trajectory.frame, self._up_to_date)
         self._ends.append(partial(self.maps.worker.close, 0.5))
-        trajectory.publishing = self.maps.worker
+        trajectory.publishing_worker = self.maps.worker
         if node.online:
             trajectory.following = Following(log, inbox, trajectory.follow)
             self._ends.append(partial(trajectory.following.close, 2.0))
@@ -154,7 +154,7 @@ class MapperNode(ManagedNode):
         feed = self.feed = Feed(lambda: self.parameters, self.associator, trajectory, self.maps, inbox, kernels, log)
         # the maps wait for kernels
         self._ends += [feed.close, kernels.release]
-        trajectory.changed = feed.replace
+        trajectory.on_change = feed.replace
         self.live, self.online = feed.live, feed.online
 
     def _make_em(self, ranges: list[str], odometry: str) -> None:
@@ -165,7 +165,7 @@ class MapperNode(ManagedNode):
         self._ends.append(partial(em.close, 2.0))
         # during EM, its intermediate maps are shown
         self.feed.shows_online = lambda: em.current is None
-        trajectory.refine = lambda: self.mapping and em.run_by_itself()
+        trajectory.request_run = lambda: self.mapping and em.run_by_itself()
         em.range_topics, em.odom_topic = ranges, odometry
         em.no_map_frame = lambda: self._map_frame.lack
         em.extrinsics, em.mounts = lambda: extrinsics.fixed, lambda: extrinsics.known
@@ -235,7 +235,7 @@ class MapperNode(ManagedNode):
         try:
             return str(self.resolve_topic_name(topic))
         except Exception as error:  # a class of rclpy's C extension
-            raise MapperError(f'{parameter}: {topic!r} is not a valid topic name: {of_ros(error)}') from None
+            raise MapperError(f'{parameter}: {topic!r} is not a valid topic name: {explain_ros_error(error)}') from None
 
     def activate(self) -> None:
         """Receive messages; they are mapped as soon as the node is ready."""

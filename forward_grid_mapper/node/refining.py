@@ -30,14 +30,14 @@ BATCH = 20_000
 """Readings after which the construction of a live map checks for cancellation."""
 
 
-class Drive(NamedTuple):
+class RefinementInput(NamedTuple):
     """Input of refinement: the poses of odometry, and all readings that they placed."""
 
     odometry: Odometry
     readings: Readings
 
 
-class Found(NamedTuple):
+class FoundTrajectory(NamedTuple):
     """The trajectory of a run.
 
     `refinement` is None if none was wanted, `correction` if odometry is used. `live` is the live map of the drive's
@@ -57,17 +57,17 @@ class RefiningMapper:
 
     Attributes
     ----------
-    found : Found or None
+    found_trajectory : FoundTrajectory or None
         Set by `run`, once the maps are made.
     """
 
     def __init__(
         self,
         parameters: Parameters,
-        drive: Callable[[], Drive],
+        drive: Callable[[], RefinementInput],
         refine: bool,
-        before: Found | None,
-        now: Callable[[], Drive] | None = None,
+        before: FoundTrajectory | None,
+        now: Callable[[], RefinementInput] | None = None,
     ) -> None:
         """Prepare a run.
 
@@ -78,12 +78,12 @@ class RefiningMapper:
             Called in the thread of the run, once the readings are available.
         refine : bool
             Whether to refine the trajectory; otherwise that of odometry is used.
-        before : Found or None
+        before : FoundTrajectory or None
             The current trajectory, on which the live map is based; None if it is that of odometry.
         now : callable, optional
             Called in the thread of the run; returns the drive so far, so that the part after the start is followed.
         """
-        self.found: Found | None = None
+        self.found_trajectory: FoundTrajectory | None = None
         self._now = now
         self._follower: Follower | None = None
         self._parameters, self._drive = parameters, drive
@@ -140,10 +140,10 @@ class RefiningMapper:
         if refinement is not None and correction is not None and self._now is not None:
             watch('following', None)
             self._follow(correction, refinement, self._now)
-        self.found = Found(refinement, correction, live, self._follower, self._kept)
+        self.found_trajectory = FoundTrajectory(refinement, correction, live, self._follower, self._kept)
         return maps
 
-    def _follow(self, correction: Correction, found: Refinement, now: Callable[[], Drive]) -> None:
+    def _follow(self, correction: Correction, found: Refinement, now: Callable[[], RefinementInput]) -> None:
         """Follow what was driven during the refinement; the maps are valid even if this fails."""
         follower = self._follower = Follower(
             correction, found.calibration, self._parameters, found.noise, found.right_angles
@@ -181,7 +181,7 @@ class RefiningMapper:
         return live
 
 
-def outcome_words(found: Found) -> str:
+def outcome_words(found: FoundTrajectory) -> str:
     """Return a description of the trajectory, in words; '' if no refinement was wanted."""
     refinement, correction = found.refinement, found.correction
     if refinement is None:

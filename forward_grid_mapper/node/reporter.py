@@ -15,13 +15,13 @@ from ..core.messages.sensor_records import MOST_FRAMES
 from . import diagnostics
 from .background import Worker
 from .em_service import EmService
-from .frames import Extrinsics, MapFrame, Transforms
+from .frames import MapFrame, TfExtrinsics, Transforms
+from .graph_check import GraphCheck
 from .intake import Intake
 from .journal_keeper import JournalKeeper
 from .kernels import Kernels
 from .live import LiveMap
 from .sensor_status import unsent_warning
-from .surroundings import Surroundings
 from .trajectory import Trajectory
 from .verdict_log import VerdictLog
 
@@ -38,7 +38,7 @@ class Reporter:
         health: diagnostics.Health,
         intake: Intake,
         associator: PoseAssociator,
-        frames: tuple[Extrinsics, MapFrame, Transforms],
+        frames: tuple[TfExtrinsics, MapFrame, Transforms],
         live: LiveMap,
         em: EmService,
         journal: JournalKeeper,
@@ -51,12 +51,12 @@ class Reporter:
         self._extrinsics, self._map_frame, transforms = frames
         self._live, self._em, self._journal, self._trajectory = live, em, journal, trajectory
         self._kernels, self._workers = kernels, list(workers)
-        self._surroundings = Surroundings(
+        self._graph_check = GraphCheck(
             node,
             intake.subscriptions,
             transforms.topics,
             lambda: bool(associator.unknown_frames),
-            lambda: trajectory.contested(transforms.latest),
+            lambda: trajectory.other_publisher_fault(transforms.latest),
         )
         self._verdicts = VerdictLog(node.get_logger())
         self._reported: set[str] = set()
@@ -82,9 +82,9 @@ class Reporter:
             self._live.grid,
             extra,
             no_map_frame := self._map_frame_fault(),
-            lambda kind: self._surroundings.absent(kind, topics[kind]),
+            lambda kind: self._graph_check.absent(kind, topics[kind]),
         )
-        faults = [*self._intake.faults(), *self._surroundings.faults(), *self._no_frame_id()]
+        faults = [*self._intake.faults(), *self._graph_check.faults(), *self._no_frame_id()]
         counts = self._associator.buffer.counts()
         limits = [
             *self._associator.message_warnings(),
@@ -122,7 +122,7 @@ class Reporter:
 
     def _unsent_fault(self, counts: Mapping[str, tuple[int, int]]) -> str:
         """Return a warning if a driver seems to send nothing without an echo, or ''; log it once."""
-        fault = unsent_warning(self._intake.heard.pauses, counts)
+        fault = unsent_warning(self._intake.silence.pauses, counts)
         if fault and not self._unsent:
             self._node.get_logger().warning(fault)
         self._unsent = bool(fault)
@@ -130,13 +130,13 @@ class Reporter:
 
     def _silent(self, counts: Mapping[str, Any], least: float = 0.0) -> dict[str, float]:
         """Return sensors that are silent for so long, and for how many seconds; log when they stop and return."""
-        silent = self._intake.heard.silent()
+        silent = self._intake.silence.silent()
         found = {frame: seconds for frame, seconds in silent.items() if frame in counts and seconds >= least}
         log = self._node.get_logger()
         if new := found.keys() - self._silent_before:
             log.warning(f'these sensors have stopped sending: {diagnostics.listed(new)}')
         # after a reset, nothing is known of sensors that were silent
-        if back := [frame for frame in self._silent_before - silent.keys() if frame in self._intake.heard]:
+        if back := [frame for frame in self._silent_before - silent.keys() if frame in self._intake.silence]:
             log.info(f'these sensors send again: {diagnostics.listed(back)}')
         self._silent_before = set(found) | (self._silent_before & silent.keys())
         return found
@@ -171,7 +171,7 @@ class Reporter:
         for frame in sorted((self._without_pose - unknown).intersection(self._associator.buffer.counts())):
             self._node.get_logger().info(f'sensor {frame} now has a pose on the robot')
         # also sensors whose readings are rejected, or wait
-        sent = {frame.lstrip('/') for frame in self._intake.heard}
+        sent = {frame.lstrip('/') for frame in self._intake.silence}
         unheard = self._extrinsics.known.keys() - sent
         # logged once for any number of new frames
         named = f'; there are poses for {diagnostics.listed(unheard)}: is it one of these?' if unheard else ''

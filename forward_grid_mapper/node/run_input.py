@@ -15,10 +15,10 @@ from ..core.messages.reading_buffer import bounded
 from ..core.trajectory.recovering import recovered, that_placed
 from ..core.trajectory.windows import Odometry
 from .background import Inbox
-from .refining import Drive
+from .refining import RefinementInput
 
 
-class _Held(NamedTuple):
+class _Taken(NamedTuple):
     """What the node holds at one moment: the number of readings accepted so far, those that are kept, and odometry."""
 
     accepted: int
@@ -55,28 +55,28 @@ class RunInput:
         """
         self._associator, self._inbox, self._cancelled = associator, inbox, cancelled
         self._mounts, self._bound = dict(mounts), associator.buffer.bound
-        self._jumped, self._late, self._begun = associator.time_jumps > 0, not compiled, False
-        self._held = self._take()
+        self._clock_jumped, self._waits_for_kernels, self._begun = associator.time_jumps > 0, not compiled, False
+        self._taken = self._take()
 
     @property
     def accepted(self) -> int:
         """Number of readings that had been accepted when the input was taken."""
-        return self._held.accepted
+        return self._taken.accepted
 
     @property
     def empty(self) -> bool:
         """Whether there is no reading."""
-        return not len(self._held.readings)
+        return not len(self._taken.readings)
 
     @property
     def odometry(self) -> Odometry:
         """Odometry messages, in the order in which they were received."""
-        return Odometry(*self._held.odometry)
+        return Odometry(*self._taken.odometry)
 
     @property
-    def fresh(self) -> bool:
+    def uses_all_readings(self) -> bool:
         """Whether the run uses all readings that have been accepted so far."""
-        waits = self._late and not self._begun
+        waits = self._waits_for_kernels and not self._begun
         return waits or self.accepted == len(self._associator.buffer)
 
     # in the thread of the run
@@ -89,22 +89,22 @@ class RunInput:
         Cancelled
         """
         self._begun = True
-        if self._late:
-            self._held = self._take_now()
-        return bounded(self._held.readings, self._bound)
+        if self._waits_for_kernels:
+            self._taken = self._take_now()
+        return bounded(self._taken.readings, self._bound)
 
-    def drive(self) -> Drive:
+    def drive(self) -> RefinementInput:
         """Return the drive up to the start of the run.
 
         After a restart, readings of the journal are the only record of the odometry before it; but after a jump back
         of the clock, the times of both overlap.
         """
-        held, known = self._held.readings, Odometry.of(*self._held.odometry)
-        if self._jumped:
-            return Drive(that_placed(held, known, self._mounts), held)
-        return Drive(recovered(known, held, self._mounts), held)
+        held, known = self._taken.readings, Odometry.of(*self._taken.odometry)
+        if self._clock_jumped:
+            return RefinementInput(that_placed(held, known, self._mounts), held)
+        return RefinementInput(recovered(known, held, self._mounts), held)
 
-    def drive_so_far(self) -> Drive:
+    def drive_so_far(self) -> RefinementInput:
         """Return the drive up to now.
 
         Raises
@@ -112,15 +112,15 @@ class RunInput:
         Cancelled
         """
         held = self._take_now()
-        return Drive(Odometry.of(*held.odometry), held.readings)
+        return RefinementInput(Odometry.of(*held.odometry), held.readings)
 
-    def _take(self) -> _Held:
+    def _take(self) -> _Taken:
         buffer = self._associator.buffer
-        return _Held(len(buffer), buffer.snapshot(), self._associator.odometry)
+        return _Taken(len(buffer), buffer.snapshot(), self._associator.odometry)
 
-    def _take_now(self) -> _Held:
+    def _take_now(self) -> _Taken:
         """Have the executor take what the node holds."""
-        answer = queue.SimpleQueue[_Held | Exception]()
+        answer = queue.SimpleQueue[_Taken | Exception]()
 
         def take() -> None:
             try:

@@ -25,7 +25,7 @@ from .deferred import Reply
 from .em import Outcome
 from .em_service import EmService
 from .live import LiveMap
-from .refining import Found
+from .refining import FoundTrajectory
 
 USES = {'ml_map.yaml': ' for Nav2', 'report.html': ' for a browser', 'report.txt': ''}
 """Files that the answer names, and what they are for."""
@@ -102,8 +102,8 @@ class Saver:
         if maps is None:
             reply.send(False, f'there is no map to save: {outcome.message}')
             return
-        account, explained, generation = self._account(), self._em.explained, self._live.generation
-        found = self._em.found
+        account, accepted_at_run, generation = self._account(), self._em.accepted_at_run, self._live.generation
+        found = self._em.found_trajectory
 
         def work() -> None:
             try:
@@ -112,22 +112,24 @@ class Saver:
                     raise MapperError('there is no map to save: reset deleted them')
                 both = maps.with_live(live.grid, live.probability)
                 with ExitStack() as named:
-                    reply.send(True, self._write(both, account, explained, found, named))
+                    reply.send(True, self._write(both, account, accepted_at_run, found, named))
             except MapperError as error:
                 reply.send(False, str(error))
 
         self.worker.put(work, lambda why: reply.send(False, f'save_maps failed: {why}'))
 
-    def _write(self, maps: MapSet, account: Account, explained: int, found: Found | None, named: ExitStack) -> str:
+    def _write(
+        self, maps: MapSet, account: Account, accepted_at_run: int, found: FoundTrajectory | None, named: ExitStack
+    ) -> str:
         """Write a folder, and return the response; once it gets its name, `named` keeps `close` waiting."""
-        newer = account.accepted - explained
+        newer = account.accepted - accepted_at_run
         warnings = account.source['warnings']
         if newer > 0:
             after = f'{counted(newer, "reading")} arrived after EM'
             warnings.append(
                 f'{after}: only the live map contains {"it" if newer == 1 else "them"}; call run_em before save_maps'
             )
-        if note := thinned(len(maps.readings), explained):
+        if note := thinned(len(maps.readings), accepted_at_run):
             warnings.append(note)
         parent = expanded(account.folder).resolve()
         path_xy = np.array(account.path, np.float64).reshape(-1, 2)

@@ -22,7 +22,7 @@ def unsent_warning(pauses: int, counts: Mapping[str, tuple[int, int]]) -> str:
     Parameters
     ----------
     pauses : int
-        How often sensors paused (`Heard.pauses`).
+        How often sensors paused (`SensorSilence.pauses`).
     counts : mapping of str to (int, int)
         From `ReadingBuffer.counts`.
     """

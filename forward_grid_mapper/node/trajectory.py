@@ -31,7 +31,7 @@ from .diagnostics import status
 from .distance import Distance
 from .following import Following
 from .pose_publishers import PERIOD, PosePublishers
-from .refining import Drive, Found, RefiningMapper, outcome_words
+from .refining import FoundTrajectory, RefinementInput, RefiningMapper, outcome_words
 
 MAP = 'map'
 """Name of the map frame if `map_frame` is empty (REP 105)."""
@@ -63,18 +63,18 @@ class Trajectory:
 
     Attributes
     ----------
-    on : bool
+    in_map_frame : bool
         Whether maps are in the map frame, and the transform from map to odometry is published.
     correction : Correction or None
         Places readings in the map frame; None if odometry is used.
-    found : Found or None
+    found_trajectory : FoundTrajectory or None
         Trajectory of the latest maps; None if none was estimated.
-    publishing : Worker
+    publishing_worker : Worker
         Makes long messages.
-    changed : callable
+    on_change : callable
         Called when maps must be made again: with the live map, None if only the frame has changed, and the number of
         readings in it.
-    refine : callable
+    request_run : callable
         Called when the drive has grown by `refine_every`; returns whether a run began.
     listening : callable
         Returns whether the node is active: an inactive node leaves the transform to others, such as AMCL.
@@ -87,22 +87,29 @@ class Trajectory:
     def __init__(self, node: Any, associator: PoseAssociator, clock: Any) -> None:
         """Prepare for `begin`; `clock` is the clock of timers."""
         self._node, self._associator, self._clock = node, associator, clock
-        self.publishing: Worker | None = None
-        self._out: PosePublishers | None = None
-        self._jumps = self._before_run = self._explained = 0
-        self.on = self._parameters.node.refine_poses
+        self.publishing_worker: Worker | None = None
+        # created when they are first needed
+        self._publishers: PosePublishers | None = None
+        # of `PoseAssociator.time_jumps`: those that `_tick` has handled, those before the latest run began, and those
+        # before the drive whose trajectory a run has found
+        self._jumps_handled = self._jumps_before_run = self._jumps_explained = 0
+        self.in_map_frame = self._parameters.node.refine_poses
         self.correction: Correction | None = None
-        self.found: Found | None = None
-        self.changed: Callable[[LogOddsMap | None, int], object] = lambda live, count: None
-        self.refine: Callable[[], bool] = lambda: False
+        self.found_trajectory: FoundTrajectory | None = None
+        self.on_change: Callable[[LogOddsMap | None, int], object] = lambda live, count: None
+        self.request_run: Callable[[], bool] = lambda: False
         self.listening: Callable[[], bool] = lambda: True
         self.following: Following | None = None
         self.distance = Distance(associator.record)
-        self._refined_at = self._shown_at = 0.0
-        self._ahead: tuple[int, float] | None = None
-        self._since = -1
-        self._showing = False
-        self._foreign: int | None = None
+        # distance driven at the start of the latest run, and when the path was last published, metres
+        self._driven_at_run = self._driven_at_path = 0.0
+        # a stamp that may be wrong, and when it arrived, monotonic seconds
+        self._stamp_ahead: tuple[int, float] | None = None
+        # the path begins after this stamp, nanoseconds
+        self._path_after = -1
+        self._path_pending = False
+        # of the transform of another publisher at the last check, nanoseconds
+        self._foreign_stamp: int | None = None
 
     @property
     def obstacle(self) -> str:
@@ -117,14 +124,14 @@ class Trajectory:
     @property
     def frame(self) -> str:
         """The frame of the maps; '' if neither odometry nor a parameter has named one."""
-        if self.on and not self.obstacle:
+        if self.in_map_frame and not self.obstacle:
             return self._map_frame
         return self._associator.map_frame or str(self._parameters.node.map_frame)
 
     @property
     def _jumped_back(self) -> bool:
         """Whether the clock jumped back, and no run has found a trajectory since then."""
-        return self._associator.time_jumps > self._explained
+        return self._associator.time_jumps > self._jumps_explained
 
     @property
     def place(self) -> Callable[[Readings], Readings] | None:
@@ -142,43 +149,43 @@ class Trajectory:
 
     def begin(self) -> None:
         """Begin a drive, with odometry as the trajectory."""
-        self.correction = self.found = None
+        self.correction = self.found_trajectory = None
         if self.following is not None:
             self.following.begin(None)
         self.distance = Distance(self._associator.record)
-        self._refined_at = self._shown_at = 0.0
+        self._driven_at_run = self._driven_at_path = 0.0
         newest = self._associator.record.newest
         # the path begins with the drive
-        self._since = -1 if newest is None else newest[0]
-        self._jumps, self._explained = self._associator.time_jumps, 0
-        self._switch(self._parameters.node.refine_poses)
-        if self._out is not None:
-            self._out.forget()
-        self._show_path()
+        self._path_after = -1 if newest is None else newest[0]
+        self._jumps_handled, self._jumps_explained = self._associator.time_jumps, 0
+        self._use_map_frame(self._parameters.node.refine_poses)
+        if self._publishers is not None:
+            self._publishers.forget()
+        self._publish_path()
 
     def mapper(
-        self, parameters: Parameters, drive: Callable[[], Drive], now: Callable[[], Drive]
+        self, parameters: Parameters, drive: Callable[[], RefinementInput], now: Callable[[], RefinementInput]
     ) -> RefiningMapper | Mapper:
         """Return a mapper for a run; `drive` returns the drive at its start, `now` the drive so far."""
-        self._refined_at, self._before_run = self.distance.driven, self._associator.time_jumps
+        self._driven_at_run, self._jumps_before_run = self.distance.driven, self._associator.time_jumps
         refine, before = parameters.node.refine_poses and not self.obstacle, None
-        if self.found is not None and self.correction is not None:
-            before = self.found._replace(correction=self.correction)
+        if self.found_trajectory is not None and self.correction is not None:
+            before = self.found_trajectory._replace(correction=self.correction)
         if not refine and before is None:
             return Mapper(parameters)
         return RefiningMapper(parameters, drive, refine, before, None if self.following is None else now)
 
-    def adopt(self, found: Found | None, count: int) -> None:
+    def adopt(self, found: FoundTrajectory | None, count: int) -> None:
         """Use the trajectory of a run for the maps of the first `count` readings; None if that is odometry."""
         before, live = self.frame, found.live if found else None
         self.correction = found.correction if found else None
         # the live map and the follower have other owners
-        self.found = found._replace(live=None, follower=None) if found and found.refinement else None
+        self.found_trajectory = found._replace(live=None, follower=None) if found and found.refinement else None
         refinement = found.refinement if found else None
         if refinement and len(refinement.trajectory.stamp):
             self.distance.explain(int(refinement.trajectory.stamp[-1]))
         if self.correction is not None:
-            self._explained = self._before_run
+            self._jumps_explained = self._jumps_before_run
         if self.following is not None:
             follower = found.follower if found else None
             if follower is not None and self._jumped_back:
@@ -187,10 +194,10 @@ class Trajectory:
             self.following.begin(follower)
             if self.following.follower is not None:
                 self.correction = self.following.follower.correction
-        self._switch(self.found is not None)
-        self._show_path()
+        self._use_map_frame(self.found_trajectory is not None)
+        self._publish_path()
         if live is not None or self.frame != before:
-            self.changed(live, count)
+            self.on_change(live, count)
 
     def follow(self, correction: Correction) -> None:
         """Use a correction that continues the adopted one."""
@@ -200,19 +207,19 @@ class Trajectory:
         """Return a description of the trajectory of the latest maps, in words; '' if odometry is used anyway."""
         if self._parameters.node.refine_poses and self.obstacle:
             return f'odometry is used as the trajectory: {self.obstacle}'
-        return outcome_words(self.found) if self.found else ''
+        return outcome_words(self.found_trajectory) if self.found_trajectory else ''
 
     def statuses(self, name: str) -> list[DiagnosticStatus]:
         """Return the status of the trajectory; none if it is not refined."""
-        if not (self.on or self._parameters.node.refine_poses):
+        if not (self.in_map_frame or self._parameters.node.refine_poses):
             return []
         values: dict[str, Any] = {
             'map frame': self.frame,
             'transform': self._transform(),
             'poses of odometry kept': self._associator.record.since_anew,
-            'driven since the latest run (m)': f'{self.distance.driven - self._refined_at:.1f}',
+            'driven since the latest run (m)': f'{self.distance.driven - self._driven_at_run:.1f}',
         }
-        refinement = self.found.refinement if self.found else None
+        refinement = self.found_trajectory.refinement if self.found_trajectory else None
         if refinement is not None and self.correction is not None:
             x, y, yaw = self.correction.last.tolist()
             wheels = calibration_words(refinement.calibration)
@@ -244,19 +251,19 @@ class Trajectory:
         level = DiagnosticStatus.WARN if troubled else DiagnosticStatus.OK
         return [status(f'{name}: trajectory', level, message, name, values)]
 
-    def contested(self, latest: Callable[[str, str], int | None]) -> str:
+    def other_publisher_fault(self, latest: Callable[[str, str], int | None]) -> str:
         """Return the fault of another publisher of the transform from map to odometry, in words, or ''.
 
         `latest` returns the stamp of the newest transform on TF, given the target and the source frame, or None.
         """
-        before, self._foreign = self._foreign, None
-        if self._out is None or not self.on or self.obstacle or not self.listening():
+        before, self._foreign_stamp = self._foreign_stamp, None
+        if self._publishers is None or not self.in_map_frame or self.obstacle or not self.listening():
             return ''
         frames = self.frame.lstrip('/'), self._associator.map_frame.lstrip('/')
         stamp = latest(*frames) if all(frames) else None
-        if stamp is None or self._out.sent_at(stamp):
+        if stamp is None or self._publishers.sent_at(stamp):
             return ''
-        self._foreign = stamp
+        self._foreign_stamp = stamp
         # the last transform of a node that has ended may be the newest for a while; a static one has the stamp 0
         if before is None or (stamp and stamp == before):
             return ''
@@ -268,38 +275,38 @@ class Trajectory:
 
     def _transform(self) -> str:
         """Return where the transform from map to odometry is published, in words."""
-        if self._out is None or not self.on or self.obstacle:
+        if self._publishers is None or not self.in_map_frame or self.obstacle:
             return 'none: the maps are in the frame of odometry'
-        return 'on TF' if self._out.by_tf else 'none: tf2_ros is not installed'
+        return 'on TF' if self._publishers.by_tf else 'none: tf2_ros is not installed'
 
-    def _switch(self, on: bool) -> None:
-        self.on = on
-        if on and self._out is None:
-            self._out = PosePublishers(self._node)
+    def _use_map_frame(self, on: bool) -> None:
+        self.in_map_frame = on
+        if on and self._publishers is None:
+            self._publishers = PosePublishers(self._node)
             self._node.create_timer(PERIOD, self._tick, clock=self._clock)
 
     def _tick(self) -> None:
         """Send the transform; called by a timer."""
         associator, newest = self._associator, self._associator.record.newest
-        if self._out is None or not self.on or self.obstacle or newest is None:
+        if self._publishers is None or not self.in_map_frame or self.obstacle or newest is None:
             return
-        if associator.time_jumps != self._jumps:
-            self._jumps, self._since = associator.time_jumps, -1
+        if associator.time_jumps != self._jumps_handled:
+            self._jumps_handled, self._path_after = associator.time_jumps, -1
             self.distance.forget()
-            self._out.forget()
+            self._publishers.forget()
             if self.following is not None and self._jumped_back:
                 self.following.end(JUMPED_BACK)
-        if associator.odometry_ahead and not self._lasts(newest[0]):
+        if associator.odometry_ahead and not self._has_lasted(newest[0]):
             return
         frames = self.frame, associator.map_frame
-        self._out.send(frames, self._correction_at(newest[0]), newest, self.listening())
-        self._advance(*newest)
+        self._publishers.send(frames, self._correction_at(newest[0]), newest, self.listening())
+        self._on_new_pose(*newest)
 
-    def _lasts(self, stamp: int) -> bool:
+    def _has_lasted(self, stamp: int) -> bool:
         """Return whether a stamp has been the newest for a while: TF would keep a wrong one, far ahead, for ever."""
-        if self._ahead is None or self._ahead[0] != stamp:
-            self._ahead = stamp, time.monotonic()
-        return time.monotonic() - self._ahead[1] > LASTING
+        if self._stamp_ahead is None or self._stamp_ahead[0] != stamp:
+            self._stamp_ahead = stamp, time.monotonic()
+        return time.monotonic() - self._stamp_ahead[1] > LASTING
 
     def _correction_at(self, stamp: int) -> NDArray[np.float64]:
         """Return the pose of the odometry frame in the map frame at a stamp, shape (3,)."""
@@ -308,47 +315,47 @@ class Trajectory:
         # stamps before the end occur after the clock jumped back, as when a bag is played repeatedly
         return (self.correction if stamp >= self.correction.end else self.correction.until(stamp)).last
 
-    def _advance(self, stamp: int, pose: Pose2) -> None:
+    def _on_new_pose(self, stamp: int, pose: Pose2) -> None:
         """Update the distance driven, and do the work that is due."""
         jump = self.distance.add(stamp, pose)
         if jump is not None and self._parameters.node.refine_poses:
             self._node.get_logger().warning(str(jump))
         if self.following is not None:
             self.following.offer(pose, lambda: (self._associator.buffer.snapshot(), self._associator.record.snapshot()))
-        if self.distance.driven - self._shown_at >= PATH_EVERY and not self._showing:
-            self._show_path()
+        if self.distance.driven - self._driven_at_path >= PATH_EVERY and not self._path_pending:
+            self._publish_path()
         every = self._parameters.node.refine_every
         if not every or not self._parameters.node.refine_poses:
             return
-        due = max(every, LEAST_EVERY, NEW_PART * self.distance.driven) <= self.distance.driven - self._refined_at
+        due = max(every, LEAST_EVERY, NEW_PART * self.distance.driven) <= self.distance.driven - self._driven_at_run
         jump = self.distance.jump
-        if jump is not None and jump.driven >= self._refined_at:
+        if jump is not None and jump.driven >= self._driven_at_run:
             due = due or self.distance.driven - jump.driven >= AFTER_JUMP
-        if due and self.refine():
-            self._refined_at = self.distance.driven
+        if due and self.request_run():
+            self._driven_at_run = self.distance.driven
 
-    def _show_path(self) -> None:
+    def _publish_path(self) -> None:
         """Have the trajectory published, continued by poses of odometry in the map frame."""
-        out, frame, correction, since = self._out, self.frame, self.correction, self._since
-        if out is None or self.publishing is None:
+        out, frame, correction, since = self._publishers, self.frame, self.correction, self._path_after
+        if out is None or self.publishing_worker is None:
             return
         stamp = self._node.get_clock().now().to_msg()
-        if not self.on:
-            self.publishing.put(lambda: out.publish_path(frame, None, stamp))
+        if not self.in_map_frame:
+            self.publishing_worker.put(lambda: out.publish_path(frame, None, stamp))
             return
         # snapshots are immutable
         stamps, poses = self._associator.record.snapshot()
-        self._shown_at, self._showing = self.distance.driven, True
+        self._driven_at_path, self._path_pending = self.distance.driven, True
 
         def publish() -> None:
-            self._showing = False
+            self._path_pending = False
             first = int(np.searchsorted(stamps, since, side='right'))
             path = Odometry(stamps[first:], poses[first:])
             if correction is not None:
                 path = correction.extended(path.stamp, path.pose)
             out.publish_path(frame, path, stamp)
 
-        self.publishing.put(publish, self._not_shown)
+        self.publishing_worker.put(publish, self._path_not_published)
 
-    def _not_shown(self, why: str) -> None:
-        self._showing = False
+    def _path_not_published(self, why: str) -> None:
+        self._path_pending = False

@@ -88,7 +88,8 @@ class PlainTrajectory:
     """Stand-in for a trajectory, with what EM needs of it."""
 
     def __init__(self, robot: EmRobot) -> None:
-        self.robot, self.on, self.correction, self.found, self.words = robot, False, None, None, ''
+        self.robot, self.in_map_frame, self.correction, self.words = robot, False, None, ''
+        self.found_trajectory = None
         self.adopted: list[tuple[Any, int]] = []
         self.asked: list[tuple[Callable[[], Any], Callable[[], Any]]] = []
 

@@ -15,7 +15,7 @@ from inside import Inside
 from robot import environment
 
 from forward_grid_mapper.core.common.errors import MapperError
-from forward_grid_mapper.node import complaints
+from forward_grid_mapper.node import error_explanations
 
 
 def rejected(domain: int, *arguments: str, **changes: str) -> tuple[int, str]:
@@ -59,7 +59,7 @@ def test_invalid_domain_is_rejected(domain: int, number: str) -> None:
 
 @pytest.mark.parametrize('number', ['', ' ', '0', '232', '+7'])
 def test_valid_domains_are_accepted(number: str) -> None:
-    assert complaints.of_domain({'ROS_DOMAIN_ID': number}) == '' == complaints.of_domain({})
+    assert error_explanations.explain_domain({'ROS_DOMAIN_ID': number}) == '' == error_explanations.explain_domain({})
 
 
 @pytest.mark.parametrize(
@@ -76,7 +76,7 @@ def test_valid_domains_are_accepted(number: str) -> None:
     ],
 )
 def test_argument_that_ros_rejects_has_a_message(arguments: list[str], expected: str) -> None:
-    assert expected in complaints.of_arguments(arguments)
+    assert expected in error_explanations.explain_arguments(arguments)
 
 
 @pytest.mark.parametrize(
@@ -88,7 +88,7 @@ def test_argument_that_ros_rejects_has_a_message(arguments: list[str], expected:
     ],
 )
 def test_unknown_ros_option_has_a_message(text: str, expected: str) -> None:
-    assert expected in complaints.of_ros_arguments(text)
+    assert expected in error_explanations.explain_ros_arguments(text)
 
 
 @pytest.mark.parametrize(
@@ -119,7 +119,7 @@ def test_unknown_ros_option_has_a_message(text: str, expected: str) -> None:
     ],
 )
 def test_error_of_rclpy_is_reported_without_source_lines(text: str, expected: str) -> None:
-    assert complaints.of_ros(RuntimeError(text)).startswith(expected)
+    assert error_explanations.explain_ros_error(RuntimeError(text)).startswith(expected)
 
 
 @pytest.mark.parametrize(
@@ -141,7 +141,7 @@ def test_error_of_rclpy_is_reported_without_source_lines(text: str, expected: st
 def test_error_in_a_parameter_file_has_a_remedy(tmp_path: Path, text: str, why: str, expected: str) -> None:
     file = tmp_path / 'my.yaml'
     file.write_text(text)
-    message = complaints.of_ros(
+    message = error_explanations.explain_ros_error(
         RuntimeError(f"Couldn't parse params file: '--params-file {file}'. Error: {why}, at /a.c:1")
     )
     assert message.startswith(f'--params-file {file}: ') and expected in message
@@ -172,10 +172,12 @@ def test_error_in_a_parameter_file_has_a_remedy(tmp_path: Path, text: str, why: 
 def test_parameter_file_of_another_node_gives_a_warning(tmp_path: Path, text: str, names: str) -> None:
     file = tmp_path / 'my.yaml'
     file.write_text(text)
-    found = complaints.of_sections(['--ros-args', '--params-file', str(file)], '/robot1/forward_grid_mapper')
+    found = error_explanations.missing_section_warnings(
+        ['--ros-args', '--params-file', str(file)], '/robot1/forward_grid_mapper'
+    )
     assert len(found) == bool(names)
     assert all(names in line and 'into a section /** or /robot1/forward_grid_mapper' in line for line in found)
-    assert complaints.of_sections(['--params-file', '/nowhere.yaml', '--params-file'], '/a') == []
+    assert error_explanations.missing_section_warnings(['--params-file', '/nowhere.yaml', '--params-file'], '/a') == []
 
 
 def test_ros_reads_the_sections_that_give_no_warning(start: Any, tmp_path: Path) -> None:

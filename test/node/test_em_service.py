@@ -48,7 +48,7 @@ def held(robot: EmRobot) -> EmRobot:
 
 def test_maps_are_published_and_kept_and_the_call_succeeds(robot: EmRobot) -> None:
     robot.warnings, robot.trajectory.words = ['ranges are copies'], 'trajectory refined'
-    assert (robot.em.last_run, robot.em.explained, robot.em.maps) == ('none yet', 0, None)
+    assert (robot.em.last_run, robot.em.accepted_at_run, robot.em.maps) == ('none yet', 0, None)
     answer = robot.run_em()
     robot.settle()
     ((success, message),) = answer.sent
@@ -61,7 +61,7 @@ def test_maps_are_published_and_kept_and_the_call_succeeds(robot: EmRobot) -> No
     assert ml[:3] == ('ml_map', 3, GRID) and ml[3][0, 0] == 5
     assert uncertainty[:3] == ('uncertainty_map', 3, GRID) and uncertainty[3].dtype == np.float32
     em = robot.em
-    assert em.maps is not None and em.explained == 5 and em.wrong_input == ['ranges are copies']
+    assert em.maps is not None and em.accepted_at_run == 5 and em.wrong_input == ['ranges are copies']
     assert em.last_run == '5 readings in 1.75 s; trajectory refined'
     assert em.sensors._table == {'sonar': 'health'}
     assert 'EM: ranges are copies' in robot.node.warned and f'EM: {em.last_run}' in robot.node.warned
@@ -76,7 +76,7 @@ def test_run_uses_thinned_readings_accepted_at_its_start(make: Callable[..., EmR
     robot.accept(2)
     robot.begun().go_on.set()
     robot.settle()
-    assert robot.searches[0].count == 38 and robot.em.explained == 40
+    assert robot.searches[0].count == 38 and robot.em.accepted_at_run == 40
 
 
 def test_readings_received_during_compilation_are_mapped(robot: EmRobot) -> None:
@@ -84,12 +84,12 @@ def test_readings_received_during_compilation_are_mapped(robot: EmRobot) -> None
     answer = robot.run_em()
     robot.until(lambda: robot.waited)
     run = robot.em.current
-    assert run is not None and run.fresh()
+    assert run is not None and run.uses_all_readings()
     robot.accept(3)
-    assert run.fresh(), 'it will look at them'
+    assert run.uses_all_readings(), 'it will look at them'
     robot.compiled.add('EM')
     robot.settle()
-    assert answer.sent[0][1].startswith('8 readings') and robot.em.explained == 8
+    assert answer.sent[0][1].startswith('8 readings') and robot.em.accepted_at_run == 8
 
 
 def test_readings_received_during_compilation_of_refinement_are_mapped(make: Callable[..., EmRobot]) -> None:
@@ -100,7 +100,7 @@ def test_readings_received_during_compilation_of_refinement_are_mapped(make: Cal
     robot.accept(3)
     robot.compiled.add('trajectory')
     robot.settle()
-    assert answer.sent[0][1].startswith('8 readings') and robot.em.explained == 8
+    assert answer.sent[0][1].startswith('8 readings') and robot.em.accepted_at_run == 8
 
 
 def test_compilation_time_is_reported_separately(robot: EmRobot) -> None:
@@ -182,7 +182,7 @@ def test_outdated_automatic_run_is_replaced_by_a_call(held: EmRobot, why: str) -
     assert answer.sent[0][0]
     (outcome,) = waiting
     assert outcome.maps is held.em.maps is not None
-    assert held.em.explained == (7 if why == 'readings' else 5)
+    assert held.em.accepted_at_run == (7 if why == 'readings' else 5)
 
 
 def test_calls_fail_if_the_run_cannot_begin(held: EmRobot, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -257,7 +257,7 @@ def test_reset_deletes_the_maps_and_cancels_the_run(held: EmRobot) -> None:
     held.em.reset()
     assert answer.sent == [(False, 'EM was cancelled by reset')]
     em = held.em
-    assert (em.maps, em.found, em.wrong_input, em.last_run) == (None, None, [], 'none since the reset')
+    assert (em.maps, em.found_trajectory, em.wrong_input, em.last_run) == (None, None, [], 'none since the reset')
     assert em.sensors._table == {}
     held.settle()
     assert em.last_run == 'EM was cancelled by reset' and em.maps is None and len(held.searches) == 2
@@ -293,7 +293,7 @@ def test_failing_run_restores_the_earlier_map(make: Callable[..., EmRobot]) -> N
     search = robot.begun()
     run = robot.em.current
     assert run is not None and search.watch is not None
-    while not run.shown:
+    while not run.map_shown:
         search.watch('search', PROGRESS)
     search.go_on.set()
     robot.settle()
@@ -344,7 +344,7 @@ def test_long_stage_without_a_map_is_logged_repeatedly(held: EmRobot, monkeypatc
 
 
 def test_maps_are_published_after_their_trajectory_is_adopted(robot: EmRobot) -> None:
-    robot.trajectory.on = True
+    robot.trajectory.in_map_frame = True
     robot.held = True
     robot.run_em()
     search = robot.begun()

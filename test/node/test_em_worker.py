@@ -189,7 +189,7 @@ def test_caller_that_fails_with_the_maps_gets_a_failure(caller: Caller) -> None:
 
     assert caller.begin(odd)
     assert caller.worker.current is not None
-    caller.worker.current.waiting += [failing, lambda outcome: outcomes.append(('last', outcome))]
+    caller.worker.current.callers += [failing, lambda outcome: outcomes.append(('last', outcome))]
     caller.conclude()
     assert [name for name, _ in outcomes] == ['odd', 'odd', 'last']
     assert outcomes[1][1].maps is None and "KeyError('odd')" in outcomes[1][1].message
@@ -236,7 +236,7 @@ def test_text_of_a_run_has_its_progress(monkeypatch: pytest.MonkeyPatch) -> None
     monkeypatch.setattr(em.time, 'monotonic', lambda: run.begin + 12.34)
     assert run.seconds == pytest.approx(12.34)
     assert str(run) == 'starting, 12.3 s'
-    assert not (run.by_itself or run.end_requested or run.shown or run.cancelled) and run.fresh()
+    assert not (run.by_itself or run.cancel_requested or run.map_shown or run.cancelled) and run.uses_all_readings()
     run.stage, run.count, run.progress = 'search', 70, Progress(3, 400, 5, 61.5)
     assert str(run).startswith('search of 70 readings, 12.3 s, iteration 3, ')
     assert str(run).endswith(' nats gained')

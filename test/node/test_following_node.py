@@ -113,7 +113,7 @@ def test_map_to_odom_is_updated_while_the_robot_drives(
     assert drifting.off(robot) < 0.35
     kept = np.hypot(*(base.last - node.trajectory.correction.last)[:2])
     assert kept > 0.3, 'the correction has moved on'
-    assert node.em.found.correction is base, 'what the run found stays'
+    assert node.em.found_trajectory.correction is base, 'what the run found stays'
     values = robot.status('trajectory')
     assert values['followed since the latest run'].startswith(f'{follower.windows} windows')
     assert values['level'] == OK

@@ -15,7 +15,7 @@ from forward_grid_mapper.core.messages.message_types import NANOSECONDS, Odometr
 from forward_grid_mapper.core.messages.pose_association import PoseAssociator
 from forward_grid_mapper.core.messages.stamp_order import JUMP
 from forward_grid_mapper.node import frames
-from forward_grid_mapper.node.frames import Extrinsics, MapFrame, Transforms
+from forward_grid_mapper.node.frames import MapFrame, TfExtrinsics, Transforms
 
 
 class TransformError(Exception):
@@ -79,19 +79,19 @@ def transforms(buffer: Buffer) -> Transforms:
 
 def test_pose_in_parameters_overrides_tf(buffer: Buffer, transforms: Transforms) -> None:
     buffer.known['base', 'sonar'] = transform(1.0, 2.0)
-    assert Extrinsics({}, transforms)('base', 'sonar', 0) == Pose2(1.0, 2.0, 0.0)
-    assert Extrinsics({'sonar': Pose2(3, 4, 5)}, transforms)('base', '/sonar', 0) == Pose2(3, 4, 5)
-    assert Extrinsics({}, transforms)('/base', '/sonar', 0) == Pose2(1.0, 2.0, 0.0)
+    assert TfExtrinsics({}, transforms)('base', 'sonar', 0) == Pose2(1.0, 2.0, 0.0)
+    assert TfExtrinsics({'sonar': Pose2(3, 4, 5)}, transforms)('base', '/sonar', 0) == Pose2(3, 4, 5)
+    assert TfExtrinsics({}, transforms)('/base', '/sonar', 0) == Pose2(1.0, 2.0, 0.0)
 
 
 def test_unknown_frame_without_tf_is_unknown_at_once() -> None:
-    assert Extrinsics({}, Transforms())('base', 'sonar', 0) is None
+    assert TfExtrinsics({}, Transforms())('base', 'sonar', 0) is None
 
 
 def test_poses_are_projected_and_steep_sensors_rejected(buffer: Buffer, transforms: Transforms) -> None:
     buffer.known['base', 'ahead'] = transform(1.0, 2.0, yaw=2.5, pitch=0.5)
     buffer.known['base', 'down'] = transform(0.0, 0.0, pitch=1.5)
-    extrinsics = Extrinsics({}, transforms)
+    extrinsics = TfExtrinsics({}, transforms)
     assert extrinsics('base', 'ahead', 0) == pytest.approx((1.0, 2.0, 2.5))
     assert extrinsics('base', 'down', 0) == STEEP
     assert extrinsics.unusable == set()
@@ -102,7 +102,7 @@ def test_unknown_frame_is_looked_up_rarely(
 ) -> None:
     now = 0.0
     monkeypatch.setattr(frames.time, 'monotonic', lambda: now)
-    extrinsics = Extrinsics({}, transforms)
+    extrinsics = TfExtrinsics({}, transforms)
     assert all(extrinsics('base', 'ghost', k) is LATER for k in range(50))
     assert buffer.lookups == 1
     now += 1.0
@@ -113,7 +113,7 @@ def test_unknown_frame_is_looked_up_rarely(
 def test_moving_sensor_has_its_pose_at_the_stamp_with_late_tf(buffer: Buffer, transforms: Transforms) -> None:
     buffer.known['base', 'servo'] = lambda stamp: transform(0.0, 0.0, yaw=stamp / NANOSECONDS)
     buffer.until = 0
-    associator = PoseAssociator(Extrinsics({}, transforms))
+    associator = PoseAssociator(TfExtrinsics({}, transforms))
     for tenth in range(5):
         stamp = tenth * NANOSECONDS // 10
         associator.add_odometry(OdometryMessage(stamp, 'odom', 'base', Pose2(0, 0, 0)))
@@ -182,7 +182,7 @@ def test_odometry_out_of_order_by_a_nanosecond_is_kept(buffer: Buffer, transform
 
 def test_odometry_with_constant_stamps_is_bounded(transforms: Transforms) -> None:
     frame = MapFrame('map', transforms, 2.0)
-    for _ in range(frames.MOST_HELD + 500):
+    for _ in range(frames.MOST_UNTRANSFORMED + 500):
         frame.convert(OdometryMessage(5, 'odom', 'base_link', Pose2(0.0, 0.0, 0.0)))
     assert frame.dropped == 500
 
@@ -210,7 +210,7 @@ def test_jump_back_of_time_renews_sensor_poses_in_the_odometry_frame(
     buffer: Buffer, transforms: Transforms, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(frames, 'PATIENCE', 0.0)
-    frame, extrinsics = MapFrame('', transforms, 2.0), Extrinsics({}, transforms)
+    frame, extrinsics = MapFrame('', transforms, 2.0), TfExtrinsics({}, transforms)
     buffer.known['base', 'sonar'] = transform(0.1, 0.0)
     frame.convert(OdometryMessage(100 * NANOSECONDS, 'odom', 'base', Pose2(0.0, 0.0, 0.0)))
     assert extrinsics('base', 'sonar', 100 * NANOSECONDS) == Pose2(0.1, 0.0, 0.0)
@@ -224,14 +224,14 @@ def test_sensor_that_looks_back_is_fixed(buffer: Buffer, transforms: Transforms)
     """Rounding decides whether its yaw is 180 or -180 degrees."""
     yaws = iter((math.pi - 1e-12, -math.pi + 1e-12))
     buffer.known['base', 'rear'] = lambda stamp: transform(-0.1, 0.0, yaw=next(yaws))
-    extrinsics = Extrinsics({}, transforms)
+    extrinsics = TfExtrinsics({}, transforms)
     first, second = extrinsics('base', 'rear', 0), extrinsics('base', 'rear', NANOSECONDS)
     assert isinstance(first, Pose2) and isinstance(second, Pose2) and first.yaw > 3.0 and second.yaw < -3.0
     assert set(extrinsics.fixed) == {'rear'}
 
 
 def test_turning_sensors_are_not_fixed(buffer: Buffer, transforms: Transforms) -> None:
-    extrinsics = Extrinsics({'given': Pose2(1.0, 2.0, 3.0)}, transforms)
+    extrinsics = TfExtrinsics({'given': Pose2(1.0, 2.0, 3.0)}, transforms)
     buffer.known['base', 'fixed'] = transform(0.1, 0.0)
     buffer.known['base', 'servo'] = lambda stamp: transform(0.1, 0.0, stamp / NANOSECONDS)
     for seconds in (0.0, 0.1, 0.2):
@@ -244,7 +244,7 @@ def test_late_transform_has_another_reason_than_an_unknown_frame(buffer: Buffer,
     buffer.known['base', 'servo'] = transform(0.1, 0.0)
     buffer.until = 0
     now = [0.0]
-    associator = PoseAssociator(Extrinsics({}, transforms), clock=lambda: now[0])
+    associator = PoseAssociator(TfExtrinsics({}, transforms), clock=lambda: now[0])
 
     def second(stamp: int, frame: str) -> None:
         associator.add_odometry(OdometryMessage(stamp * NANOSECONDS, 'odom', 'base', Pose2(0, 0, 0)))
@@ -265,7 +265,7 @@ def test_frame_with_a_transform_is_removed_from_unknown_frames(
 ) -> None:
     monkeypatch.setattr(frames, 'PATIENCE', 0.0)
     now = [0.0]
-    associator = PoseAssociator(Extrinsics({}, transforms), clock=lambda: now[0])
+    associator = PoseAssociator(TfExtrinsics({}, transforms), clock=lambda: now[0])
     for stamp in range(10):
         associator.add_odometry(OdometryMessage(stamp * NANOSECONDS, 'odom', 'base', Pose2(0, 0, 0)))
         associator.add_range(RangeMessage(stamp * NANOSECONDS, 'sonar', 1.0, 0.1, 3.0, 0.3))
@@ -349,8 +349,8 @@ def test_odometry_waits_as_long_as_the_timeout_parameter(transforms: Transforms,
     for k in range(50):
         frame.convert(OdometryMessage(k * NANOSECONDS // 10, 'odom', 'base', Pose2(0, 0, 0)))
     # odometry exactly as old as the timeout still waits
-    assert len(frame._held) == 10 * timeout // 1 + 1
-    assert frame.dropped + len(frame._held) == 50
+    assert len(frame._untransformed) == 10 * timeout // 1 + 1
+    assert frame.dropped + len(frame._untransformed) == 50
 
 
 @pytest.mark.parametrize('begin', [0, 1_700_000_000 * NANOSECONDS])
@@ -405,7 +405,7 @@ def test_number_of_remembered_sensor_poses_is_bounded(
     buffer: Buffer, transforms: Transforms, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(frames, 'MOST_MISSING', 2)
-    extrinsics = Extrinsics({}, transforms)
+    extrinsics = TfExtrinsics({}, transforms)
     for k in range(4):
         buffer.known['base', f'sonar {k}'] = transform(0.1 * k, 0.0)
         assert extrinsics('base', f'sonar {k}', 5) == Pose2(0.1 * k, 0.0, 0.0)

@@ -142,10 +142,10 @@ def test_reset_of_the_intake_clears_all_counts() -> None:
     robot.odometry(100.0, number=1)
     robot.odometry(100.1, number=8)
     assert (robot.intake.lost, robot.intake.odometry_lost) == (48, 6)
-    assert 'sonar' in robot.intake.heard and robot.intake.busy
+    assert 'sonar' in robot.intake.silence and robot.intake.busy
     robot.intake.forget()
     assert (robot.intake.received, robot.intake.waiting, robot.intake.lost, robot.intake.odometry_lost) == (0, 0, 0, 0)
-    assert 'sonar' not in robot.intake.heard and not robot.intake.busy
+    assert 'sonar' not in robot.intake.silence and not robot.intake.busy
     assert robot.intake.loss_note() == []
 
 
@@ -174,7 +174,7 @@ def test_topics_are_subscribed_once_and_unsubscribed() -> None:
     robot.odometry(100.0, number=30)
     intake.unsubscribe()
     assert not intake.listening and node.subscribed == {} and intake.subscriptions == {}
-    assert 'sonar' not in intake.heard
+    assert 'sonar' not in intake.silence
     intake.subscribe()
     # messages published meanwhile do not count as lost
     robot.range(101.0, number=500)
@@ -397,7 +397,7 @@ def test_waiting_messages_of_a_topic_are_received_in_one_call(monkeypatch: pytes
 
     monkeypatch.setattr(robot.node, 'create_subscription', subscribe)
     robot.intake.subscribe()
-    for topic, came in (('sonar', lambda: robot.intake.received), ('odom', lambda: robot.intake.odometry_came)):
+    for topic, came in (('sonar', lambda: robot.intake.received), ('odom', lambda: robot.intake.odometry_arrived)):
         waiting.extend(range(4 - len(waiting)))
         kind = {'sonar': Range, 'odom': Odometry}[topic]
         robot.node.subscribed[topic][0](kind(), {'source_timestamp': 0})

@@ -363,7 +363,7 @@ def test_clean_up_responds_to_waiting_calls(inside: Callable[..., Inside], peer:
         client = other.create_client(Trigger, f'/forward_grid_mapper/{name}')
         robot.until(client.service_is_ready, 20.0)
         calls.append(client.call_async(Trigger.Request()))
-    robot.until(lambda: node.em.current and len(node.em.current.waiting) == 2, 20.0)
+    robot.until(lambda: node.em.current and len(node.em.current.callers) == 2, 20.0)
     assert node.trigger_deactivate() == node.trigger_cleanup() == TransitionCallbackReturn.SUCCESS
     robot.until(lambda: all(call.done() for call in calls), 20.0)
     for call in calls:

@@ -148,7 +148,7 @@ def test_em_maps_readings_received_during_compilation(
     robot.until(lambda: answers)
     assert answers[0][0]
     assert answers[0][1].startswith('50 readings')
-    assert node.em.explained == 50
+    assert node.em.accepted_at_run == 50
 
 
 def test_em_fails_if_newer_readings_do_not_fit_into_memory(

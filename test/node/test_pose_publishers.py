@@ -23,7 +23,7 @@ from sensor_msgs.msg import MultiDOFJointState
 from forward_grid_mapper.core.messages.message_types import NANOSECONDS, Pose2
 from forward_grid_mapper.core.trajectory.poses import compose
 from forward_grid_mapper.core.trajectory.windows import Odometry
-from forward_grid_mapper.node import pose_publishers, surroundings, trajectory
+from forward_grid_mapper.node import graph_check, pose_publishers, trajectory
 from forward_grid_mapper.node.pose_publishers import REPEAT
 
 OK, WARN = b'\x00', b'\x01'
@@ -166,7 +166,7 @@ def test_transform_is_repeated_without_new_odometry(
 def test_other_publisher_of_the_transform_is_a_fault(
     inside: Callable[..., Inside], tf2_ros: type[Broadcaster], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(surroundings, 'GRAPH_PERIOD', 0.0)
+    monkeypatch.setattr(graph_check, 'GRAPH_PERIOD', 0.0)
     robot, _ = mapping(inside, monkeypatch)
     fault = 'another node publishes the transform from map to odom as well'
     robot.drive(0, 40)
@@ -192,7 +192,7 @@ def test_other_publisher_of_the_transform_is_a_fault(
 def test_other_publisher_is_no_fault_without_refinement(
     inside: Callable[..., Inside], tf2_ros: type[Broadcaster], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(surroundings, 'GRAPH_PERIOD', 0.0)
+    monkeypatch.setattr(graph_check, 'GRAPH_PERIOD', 0.0)
     robot = inside().start()
     robot.drive(0, 40)
     tf2_ros.newest = TransformStamped()
@@ -205,7 +205,7 @@ def test_one_stamp_from_the_future_is_not_published_to_tf(
     robot, clock = mapping(inside, monkeypatch)
     tick, sent = robot.node.trajectory._tick, tf2_ros.sent
     path: list[Any] = []
-    monkeypatch.setattr(robot.node.trajectory._out, 'publish_path', lambda frame, made, stamp: path.append(made))
+    monkeypatch.setattr(robot.node.trajectory._publishers, 'publish_path', lambda frame, made, stamp: path.append(made))
     for k in range(100):
         robot.odometry(100.0 + 0.1 * k + (1e8 if k == 50 else 0.0), 0.05 * k)
         tick()
@@ -257,7 +257,9 @@ def test_path_begins_with_the_drive_after_a_jump_back(
     robot.drive(0, 50)
     robot.call(robot.node.reset)
     shown: list[Any] = []
-    monkeypatch.setattr(robot.node.trajectory._out, 'publish_path', lambda frame, path, stamp: shown.append(path))
+    monkeypatch.setattr(
+        robot.node.trajectory._publishers, 'publish_path', lambda frame, path, stamp: shown.append(path)
+    )
     for k in range(20):
         robot.odometry(20.0 + 0.1 * k, 0.1 * k)
         robot.node.trajectory._tick()

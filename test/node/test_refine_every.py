@@ -43,7 +43,7 @@ def test_node_refines_after_the_distance_of_refine_every(
     robot.until(lambda: node.em.maps is not first and node.em.current is None)
     # a service call restarts the distance
     assert robot.call(node.em.run_em)[0]
-    assert node.trajectory.distance.driven - node.trajectory._refined_at < 0.05
+    assert node.trajectory.distance.driven - node.trajectory._driven_at_run < 0.05
 
 
 def test_node_refines_soon_after_a_jump(
@@ -124,7 +124,7 @@ def test_path_grows_as_the_robot_drives(
     monkeypatch.setattr(trajectory, 'PATH_EVERY', 0.02)
     robot = inside(refine_poses=True).start()
     shown: list[Any] = []
-    out = robot.node.trajectory._out
+    out = robot.node.trajectory._publishers
     assert out is not None
     monkeypatch.setattr(out, 'publish_path', lambda frame, path, stamp: shown.append(path))
     begin(robot)

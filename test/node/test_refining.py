@@ -300,7 +300,7 @@ def test_reset_deletes_the_trajectory(inside: Callable[..., Inside], quick: Any)
     robot, _ = refined(inside(refine_poses=True).start())
     robot.call(robot.node.reset)
     assert robot.node.trajectory.correction is None
-    assert robot.node.trajectory.found is None
+    assert robot.node.trajectory.found_trajectory is None
     assert robot.status('trajectory')['poses of odometry kept'] == '0', 'of the drive before'
     robot.drive(200, 30)
     assert_live(robot, None)
@@ -335,7 +335,7 @@ def test_reset_and_cancel_end_a_refinement(inside: Callable[..., Inside], monkey
         assert not answer.sent[0][0]
         assert 'cancelled' in answer.sent[0][1]
         assert robot.node.trajectory.correction is None
-        assert robot.node.trajectory.found is None
+        assert robot.node.trajectory.found_trajectory is None
     assert_live(robot, None)
 
 

@@ -17,9 +17,9 @@ from forward_grid_mapper.core.common.grid import Grid
 from forward_grid_mapper.core.messages.message_types import NANOSECONDS, Pose2
 from forward_grid_mapper.node import diagnostics
 from forward_grid_mapper.node.diagnostics import RECENT, Health
-from forward_grid_mapper.node.frames import Extrinsics, MapFrame, Transforms
-from forward_grid_mapper.node.heard import USUAL
+from forward_grid_mapper.node.frames import MapFrame, TfExtrinsics, Transforms
 from forward_grid_mapper.node.reporter import Reporter
+from forward_grid_mapper.node.sensor_silence import SILENT_INTERVALS
 from forward_grid_mapper.node.verdict_log import ENDED, LOOKS, VerdictLog
 
 OK, WARN = b'\x00', b'\x01'
@@ -184,7 +184,7 @@ def test_sensor_with_readings_every_five_seconds_is_not_silent(clock: Any) -> No
     seconds(robot, clock, health, 10, 5, 'sonar')
     verdicts = seconds(robot, clock, health, 20, 5, 'sonar')
     assert set(verdicts) == {(OK, 'mapping')}
-    verdicts = seconds(robot, clock, health, int(5 * USUAL) + 5, 1000, 'sonar')
+    verdicts = seconds(robot, clock, health, int(5 * SILENT_INTERVALS) + 5, 1000, 'sonar')
     assert verdicts[-1][0] == WARN and verdicts[-1][1].startswith('no Range for ')
 
 
@@ -409,7 +409,7 @@ def test_message_without_a_base_frame_suggests_no_transform() -> None:
         robot.odometry(100.0)
         reporter = reporter_of(robot)
         reporter._reported, reporter._without_pose, reporter._far = set(), set(), False
-        reporter._extrinsics = Extrinsics({}, Transforms())
+        reporter._extrinsics = TfExtrinsics({}, Transforms())
         robot.associator.base_frame = child
         robot.associator.unknown_frames.add('sonar')
         reporter._name_frames()
@@ -427,7 +427,7 @@ def test_unused_poses_are_suggested_for_a_frame_without_pose() -> None:
     # a frame with waiting readings
     robot.range(200.0, '/waits')
     poses = {name: Pose2(0.1, 0.0, 0.0) for name in ('sonar', 'us_left', 'us_right', 'waits')}
-    reporter._extrinsics = Extrinsics(poses, Transforms())
+    reporter._extrinsics = TfExtrinsics(poses, Transforms())
     robot.associator.unknown_frames.update(('left', 'right'))
     reporter._name_frames()
     text, other = robot.node.warned

@@ -23,7 +23,7 @@ from forward_grid_mapper.files.output_folder import TakenError, output_folder
 from forward_grid_mapper.node import saver
 from forward_grid_mapper.node.em import Outcome
 from forward_grid_mapper.node.live import LiveSnapshot
-from forward_grid_mapper.node.refining import Found
+from forward_grid_mapper.node.refining import FoundTrajectory
 from forward_grid_mapper.node.saver import Account, Saver
 
 GRID = Grid(0.1, 0, 0, 3, 2)
@@ -62,7 +62,7 @@ class Node:
         self.log = PlainNode()
         self.written: list[tuple[Any, ...]] = []
         self.generation, self.waiting, self.accepted = 4, list[Callable[[Outcome], object]](), 10
-        self.em: Any = SimpleNamespace(maps=None, current=None, explained=10, found=None)
+        self.em: Any = SimpleNamespace(maps=None, current=None, accepted_at_run=10, found_trajectory=None)
         self.em.when_there_are_maps = self.waiting.append
         self.live: Any = SimpleNamespace(
             generation=4, snapshot=lambda: LiveSnapshot(self.generation, GRID, LIVE), worker=None
@@ -203,7 +203,7 @@ def test_readings_received_after_em_give_a_warning(node: Node, newer: int, expec
 
 
 def test_thinned_readings_give_a_warning(node: Node) -> None:
-    node.em.explained = node.accepted = 25
+    node.em.accepted_at_run = node.accepted = 25
     node.save().answer()
     assert 'EM used 10 of 25 readings' in node.written[0][2]['warnings'][1]
 
@@ -291,17 +291,17 @@ def test_clean_up_waits_while_a_folder_gets_its_name(node: Node) -> None:
     assert reply.answer()[0] and closed == [1], 'answered before the node says that it is being cleaned up'
 
 
-def trajectory(moved: bool, unplaced: int = 0) -> Found:
+def trajectory(moved: bool, unplaced: int = 0) -> FoundTrajectory:
     correction = SimpleNamespace(odometry='odometry', path_of=lambda stamp, pose: ('path of', stamp, pose))
     refinement = SimpleNamespace(unplaced=unplaced, jumps='odometry jumped')
-    found: Any = Found(refinement, correction if moved else None, None)  # type: ignore[arg-type]
+    found: Any = FoundTrajectory(refinement, correction if moved else None, None)  # type: ignore[arg-type]
     return found  # type: ignore[no-any-return]
 
 
 def test_trajectory_is_written_with_the_maps(node: Node, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(saver, 'trajectory_data', lambda refinement: {'jumps': refinement.jumps})
     monkeypatch.setattr(saver, 'trajectory_files', lambda refinement, odometry: {'trajectory.tum': odometry})
-    node.em.found = trajectory(moved=True)
+    node.em.found_trajectory = trajectory(moved=True)
     node.save().answer()
     _, _, source, path_xy, _, options = node.written[-1]
     assert source['trajectory'] == {'jumps': 'odometry jumped'}
@@ -310,11 +310,11 @@ def test_trajectory_is_written_with_the_maps(node: Node, monkeypatch: pytest.Mon
     assert options['odometry_xy'].tolist() == [[0.0, 1.0], [2.0, 3.0]]
     assert source['warnings'] == ['from the node']
     # if odometry is kept, the path is that of odometry; if a part could not be placed, there is a warning
-    node.em.found = trajectory(moved=False, unplaced=3)
+    node.em.found_trajectory = trajectory(moved=False, unplaced=3)
     node.save().answer()
     _, _, source, path_xy, _, options = node.written[-1]
     assert source['trajectory'] and path_xy.shape == (2, 2) and options == {}
     assert source['warnings'] == ['from the node', 'odometry jumped']
-    node.em.found = Found(None, None, None)
+    node.em.found_trajectory = FoundTrajectory(None, None, None)
     node.save().answer()
     assert 'trajectory' not in node.written[-1][2]

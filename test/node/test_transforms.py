@@ -22,7 +22,7 @@ from rclpy.lifecycle.node import TransitionCallbackReturn
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import MultiDOFJointState
 
-from forward_grid_mapper.node import frames, intake, surroundings
+from forward_grid_mapper.node import frames, graph_check, intake
 
 VOLATILE = QoSProfile(depth=10, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.VOLATILE)
 WARN = b'\x01'
@@ -88,7 +88,7 @@ def tf2(monkeypatch: pytest.MonkeyPatch) -> None:
     modules['tf2_msgs.msg'].TFMessage = MultiDOFJointState  # type: ignore[attr-defined]
     for name, module in modules.items():
         monkeypatch.setitem(sys.modules, name, module)
-    monkeypatch.setattr(surroundings, 'GRAPH_PERIOD', 0.05)
+    monkeypatch.setattr(graph_check, 'GRAPH_PERIOD', 0.05)
     monkeypatch.setattr(frames, 'TRANSFORM_PATIENCE', 0.2)
     monkeypatch.setattr(frames, 'PATIENCE', 0.0)
 

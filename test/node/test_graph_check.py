@@ -13,7 +13,7 @@ from rclpy.qos import QoSProfile, ReliabilityPolicy
 from robot import Robot
 from sensor_msgs.msg import Range
 
-from forward_grid_mapper.node.surroundings import Surroundings
+from forward_grid_mapper.node.graph_check import GraphCheck
 from forward_grid_mapper.node.trajectory import Trajectory
 
 
@@ -65,7 +65,7 @@ def test_reason_for_missing_messages(published: dict[str, str], expected: str) -
         ],
         count_publishers=published.__contains__,
     )
-    assert Surroundings(node, {}).absent('Range', ['/sonar']) == expected
+    assert GraphCheck(node, {}).absent('Range', ['/sonar']) == expected
 
 
 @pytest.mark.parametrize(
@@ -84,13 +84,15 @@ def test_other_publisher_of_the_correction_is_reported_while_it_publishes(
 ) -> None:
     own = SimpleNamespace(sent_at=lambda stamp: False)
     trajectory: Any = SimpleNamespace(
-        _foreign=None,
-        _out=own,
-        on=True,
+        _foreign_stamp=None,
+        _publishers=own,
+        in_map_frame=True,
         obstacle='',
         listening=lambda: True,
         frame='map',
         _associator=SimpleNamespace(map_frame='odom'),
     )
-    found = [Trajectory.contested(trajectory, lambda target, source, stamp=stamp: stamp) for stamp in stamps]
+    found = [
+        Trajectory.other_publisher_fault(trajectory, lambda target, source, stamp=stamp: stamp) for stamp in stamps
+    ]
     assert [text.startswith('another node publishes the transform from map to odom') for text in found] == reported

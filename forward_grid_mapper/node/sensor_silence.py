@@ -11,11 +11,11 @@ from ..core.messages.sensor_records import has_room
 TIME_OUT = 3.0
 """Shortest time without a message, seconds, after which a sensor is silent."""
 
-USUAL = 5.0
+SILENT_INTERVALS = 5.0
 """Time without a message, in usual intervals, after which a sensor that sends rarely is silent."""
 
 PAUSE = 0.5
-"""Shortest time without a message, seconds, that counts as a pause; also at least `USUAL` intervals."""
+"""Shortest time without a message, seconds, that counts as a pause; also at least `SILENT_INTERVALS` intervals."""
 
 
 class _Sensor(NamedTuple):
@@ -28,10 +28,10 @@ class _Sensor(NamedTuple):
 
 def _patience(interval: float) -> float:
     """Return the seconds after which a sensor with this usual interval is silent."""
-    return max(TIME_OUT, USUAL * interval)
+    return max(TIME_OUT, SILENT_INTERVALS * interval)
 
 
-class Heard:
+class SensorSilence:
     """The time of the last message of each sensor, and its usual interval.
 
     A sensor is silent if others sent something long after it. The time in which no messages arrive at all does not
@@ -74,7 +74,7 @@ class Heard:
         if before is not None:
             last, interval, idle = before
             gap = now - last
-            if interval and gap - (self._idle - idle) > max(PAUSE, USUAL * interval):
+            if interval and gap - (self._idle - idle) > max(PAUSE, SILENT_INTERVALS * interval):
                 self.pauses += 1
             if not interval:
                 interval = gap

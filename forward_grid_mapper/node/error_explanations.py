@@ -39,7 +39,7 @@ def _nearest(word: str, known: Sequence[str]) -> str:
     return f'; did you mean {near[0]}?' if near else ''
 
 
-def of_arguments(left: Sequence[str]) -> str:
+def explain_arguments(left: Sequence[str]) -> str:
     """Return a remedy for arguments that are not ROS's."""
     parameters = [row.name for row in TABLE]
     for word in left:
@@ -57,7 +57,7 @@ def of_arguments(left: Sequence[str]) -> str:
     return f'{" ".join(left)} is not known{_nearest(left[0], OPTIONS)}; ROS options must be after --ros-args'
 
 
-def of_ros_arguments(text: str) -> str:
+def explain_ros_arguments(text: str) -> str:
     """Return a remedy for unknown arguments after --ros-args; rclpy gives them as the text of a list."""
     unknown = re.findall(r"'([^']*)'", text) or [text]
     word = unknown[0]
@@ -66,7 +66,7 @@ def of_ros_arguments(text: str) -> str:
     return f'{", ".join(unknown)}: no such ROS option{_nearest(word, ROS_OPTIONS)}; known are {", ".join(ROS_OPTIONS)}'
 
 
-def of_domain(environment: Mapping[str, str]) -> str:
+def explain_domain(environment: Mapping[str, str]) -> str:
     """Return what is wrong with ROS_DOMAIN_ID, or ''."""
     text = environment.get('ROS_DOMAIN_ID', '').strip()
     if re.fullmatch(r'\+?[0-9]+', text or '0') and int(text or '0') <= HIGHEST_DOMAIN:
@@ -74,7 +74,7 @@ def of_domain(environment: Mapping[str, str]) -> str:
     return f'ROS_DOMAIN_ID is {text}, not a whole number from 0 to {HIGHEST_DOMAIN}'
 
 
-def _of_file(path: str, why: str) -> str:
+def _explain_file(path: str, why: str) -> str:
     """Return the fault of a parameter file: from our own reader if it refuses the file as well."""
     if Path(path).is_file():
         try:
@@ -87,7 +87,7 @@ def _of_file(path: str, why: str) -> str:
     return f'--params-file {path}: {why}{remedy}'
 
 
-def of_ros(error: BaseException) -> str:
+def explain_ros_error(error: BaseException) -> str:
     """Return the message of an rclpy error, without the lines of its sources, and with a remedy if one is known."""
     lines = _SOURCE.sub('', str(error)).splitlines()
     text = _INIT.sub('', ' '.join(filter(None, (line.strip() for line in lines))))
@@ -103,13 +103,13 @@ def of_ros(error: BaseException) -> str:
             return f'{rule}: write each number of a list with a decimal point; ROS refuses lists of mixed types'
         return f'{rule}: use -p NAME:=VALUE, such as -p resolution:=0.05'
     if found := _FILE.search(text):
-        return _of_file(found['file'], found['why'])
+        return _explain_file(found['file'], found['why'])
     if 'PARAMETER_NOT_SET' in text:
         return 'a parameter has no value, or an empty list (range_topics:=[]): set a value, or leave it out'
     return text or repr(error)
 
 
-def of_sections(arguments: Sequence[str], node: str) -> list[str]:
+def missing_section_warnings(arguments: Sequence[str], node: str) -> list[str]:
     """Return warnings about parameter files without a section for a node; ROS ignores such a file silently.
 
     Parameters

@@ -13,8 +13,8 @@ pytest.importorskip('rclpy', reason='the tests of the node need rclpy')
 from inside import Inside
 
 from forward_grid_mapper.core.messages.sensor_records import MOST_FRAMES
-from forward_grid_mapper.node import heard
-from forward_grid_mapper.node.heard import PAUSE, TIME_OUT, USUAL, Heard
+from forward_grid_mapper.node import sensor_silence
+from forward_grid_mapper.node.sensor_silence import PAUSE, SILENT_INTERVALS, TIME_OUT, SensorSilence
 from forward_grid_mapper.node.sensor_status import PAUSES
 
 OK, WARN = b'\x00', b'\x01'
@@ -25,7 +25,7 @@ class Clock:
 
     def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
         self.now = 500.0
-        monkeypatch.setattr(heard.time, 'monotonic', lambda: self.now)
+        monkeypatch.setattr(sensor_silence.time, 'monotonic', lambda: self.now)
 
 
 @pytest.fixture
@@ -33,7 +33,7 @@ def clock(monkeypatch: pytest.MonkeyPatch) -> Clock:
     return Clock(monkeypatch)
 
 
-def pass_by(clock: Clock, sensors: Heard, seconds: float, **intervals: float) -> None:
+def pass_by(clock: Clock, sensors: SensorSilence, seconds: float, **intervals: float) -> None:
     """Let time pass; each of these sensors sends once in its interval."""
     begin = clock.now
     times = sorted(
@@ -48,7 +48,7 @@ def pass_by(clock: Clock, sensors: Heard, seconds: float, **intervals: float) ->
 
 
 def test_sensor_that_stops_is_silent_until_it_sends_again(clock: Clock) -> None:
-    sensors = Heard()
+    sensors = SensorSilence()
     pass_by(clock, sensors, 10.0, left=0.1, right=0.1)
     assert sensors.silent() == {}
     pass_by(clock, sensors, TIME_OUT - 0.1, right=0.1)
@@ -63,7 +63,7 @@ def test_sensor_that_stops_is_silent_until_it_sends_again(clock: Clock) -> None:
 
 
 def test_pauses_are_counted_if_others_send_meanwhile(clock: Clock) -> None:
-    sensors = Heard()
+    sensors = SensorSilence()
     pass_by(clock, sensors, 10.0, left=0.1, right=0.1, slow=0.5)
     assert sensors.pauses == 0
     for k in range(3):
@@ -85,7 +85,7 @@ def test_pauses_are_counted_if_others_send_meanwhile(clock: Clock) -> None:
 
 
 def test_no_sensor_is_silent_if_all_have_stopped(clock: Clock) -> None:
-    sensors = Heard()
+    sensors = SensorSilence()
     pass_by(clock, sensors, 10.0, left=0.1, right=0.13, slow=2.0)
     pass_by(clock, sensors, 1000.0)
     assert sensors.silent() == {}
@@ -97,17 +97,17 @@ def test_no_sensor_is_silent_if_all_have_stopped(clock: Clock) -> None:
 
 def test_pauses_of_all_do_not_change_the_usual_interval(clock: Clock) -> None:
     """Otherwise a sensor that sends once in a while would be silent after bags that were paused several times."""
-    sensors = Heard()
+    sensors = SensorSilence()
     pass_by(clock, sensors, 100.0, slow=5.0)
     for _ in range(30):
         pass_by(clock, sensors, 60.0)
         sensors.note('slow')
-    assert sensors.patience == pytest.approx(USUAL * 5.0)
+    assert sensors.patience == pytest.approx(SILENT_INTERVALS * 5.0)
 
 
 def test_first_sensor_after_a_pause_of_all_does_not_make_the_others_silent(clock: Clock) -> None:
     """As when a bag is paused: the report may come between their messages."""
-    sensors = Heard()
+    sensors = SensorSilence()
     pass_by(clock, sensors, 10.0, left=0.1, right=0.1, broken=0.1)
     pass_by(clock, sensors, 10.0, left=0.1, right=0.1)
     for _ in range(3):
@@ -121,10 +121,10 @@ def test_first_sensor_after_a_pause_of_all_does_not_make_the_others_silent(clock
 
 
 def test_sensor_that_sends_rarely_has_a_longer_limit(clock: Clock) -> None:
-    sensors = Heard()
+    sensors = SensorSilence()
     pass_by(clock, sensors, 100.0, fast=0.1, slow=5.0)
     assert sensors.silent() == {}
-    pass_by(clock, sensors, USUAL * 5.0 - 0.1, fast=0.1)
+    pass_by(clock, sensors, SILENT_INTERVALS * 5.0 - 0.1, fast=0.1)
     assert sensors.silent() == {}
     pass_by(clock, sensors, 0.3, fast=0.1)
     assert set(sensors.silent()) == {'slow'}
@@ -134,7 +134,7 @@ def test_sensor_that_sends_rarely_has_a_longer_limit(clock: Clock) -> None:
 
 def test_interval_of_sensors_that_all_send_rarely_is_learned(clock: Clock) -> None:
     """Their first intervals are no pauses, and one that stops is silent."""
-    sensors = Heard()
+    sensors = SensorSilence()
     for k in range(20):
         clock.now = 500.0 + 5.0 * k
         sensors.note('left')
@@ -143,11 +143,11 @@ def test_interval_of_sensors_that_all_send_rarely_is_learned(clock: Clock) -> No
             sensors.note('right')
         assert ('right' in sensors.silent()) == (k >= 15)
         assert 'left' not in sensors.silent()
-    assert sensors.patience == pytest.approx(5 * USUAL, rel=0.1)
+    assert sensors.patience == pytest.approx(5 * SILENT_INTERVALS, rel=0.1)
 
 
 def test_unprintable_names_and_too_many_are_ignored(clock: Clock) -> None:
-    sensors = Heard()
+    sensors = SensorSilence()
     for name in ('', 'a\nb', 'x' * 256, *(f'made up {k}' for k in range(2 * MOST_FRAMES))):
         sensors.note(name)
     assert '' not in sensors and 'a\nb' not in sensors and 'x' * 256 not in sensors

@@ -18,7 +18,7 @@ PARAMETER = {'Range': 'range_topics, or remap sonar', 'Odometry': 'odom_topic, o
 """Parameters that set the topics of a kind."""
 
 
-class Surroundings:
+class GraphCheck:
     """Checks the graph periodically; logs each fault once, and reports it while it lasts."""
 
     def __init__(
@@ -27,7 +27,7 @@ class Surroundings:
         subscriptions: dict[str, QoSProfile],
         transforms: tuple[str, ...] = (),
         frames_missing: Callable[[], bool] = lambda: False,
-        contested: Callable[[], str] = str,
+        other_publisher_fault: Callable[[], str] = str,
     ) -> None:
         """Prepare to check.
 
@@ -40,11 +40,12 @@ class Surroundings:
             The topics of TF and of static TF; empty if the node does not subscribe to TF.
         frames_missing : callable
             Returns whether a sensor has no pose.
-        contested : callable
+        other_publisher_fault : callable
             Returns the fault of another publisher of a transform that this node publishes, or ''.
         """
         self._node, self._subscriptions = node, subscriptions
-        self._transforms, self._frames_missing, self._contested = transforms, frames_missing, contested
+        self._transforms, self._frames_missing = transforms, frames_missing
+        self._other_publisher_fault = other_publisher_fault
         self._reported: set[str] = set()
         self._next = 0.0
         self._begin = time.monotonic()
@@ -56,7 +57,7 @@ class Surroundings:
         if now >= self._next:
             self._next = now + GRAPH_PERIOD
             self._faults = [*self._incompatible(), *self._transforms_lost(), *self._no_clock(), *self._same_names()]
-            self._faults += filter(None, [self._contested()])
+            self._faults += filter(None, [self._other_publisher_fault()])
             for fault in self._faults:
                 if fault not in self._reported and len(self._reported) < 100:
                     self._reported.add(fault)
