@@ -20,7 +20,7 @@ from .common.grid import UNKNOWN
 from .common.parameter_groups import ModelParameters
 from .common.parameters import Parameters
 from .common.readings import Floats, Readings
-from .joint_learning import SURE, CrossValidation, Learned, Watch, learn_jointly
+from .joint_learning import LEAST_STANDARD_ERRORS, CrossValidation, Learned, Watch, learn_jointly
 from .mapping import Mapper
 from .maps.map_set import MapSet
 from .messages.message_types import NANOSECONDS
@@ -125,7 +125,7 @@ def only_if_validated(
         'predict held-out readings better than the map of the initial values. Its gain, with the standard error, is '
         f'{at_first:+.3f} ± {validation.error_at_first:.3f} nats a reading by the initial model and '
         f'{at_learned:+.3f} ± {validation.error_at_learned:.3f} by the learned one; both must be larger than '
-        f'{SURE:g} standard error. '
+        f'{LEAST_STANDARD_ERRORS:g} standard error. '
         '--keep-going writes the learned values in any case'
     )
     return dataclasses.replace(

@@ -15,20 +15,20 @@ from .mapping import Mapper
 from .maps.map_set import MapSet
 from .sensor.forward_model import ForwardModel
 
-STRETCHES, LENGTH = 3, 2000
+MOST_STRETCHES, STRETCH_READINGS = 3, 2000
 """Most parts of a drive that are mapped, and readings of each: they limit the cost."""
 
-ENOUGH = 300
+LEAST_READINGS = 300
 """Fewest readings of a drive that is checked."""
 
-WORSE = 0.15
+LEAST_MISFIT = 0.15
 """Nats a reading by which the map of all must be worse for a warning. It is at most 0.09 for drives that fit, and more
 than 0.2 for an offset of 0.3 m; one of 0.1 m is not found."""
 
-ALIKE = 0.5
+NAMED_FRACTION = 0.5
 """Other drives are named if their misfit is at least this fraction of the largest; those that fit are affected, too."""
 
-NAMED = 6
+MOST_NAMED = 6
 
 
 def misfits(maps: MapSet, drives: int) -> list[float]:
@@ -39,11 +39,11 @@ def misfits(maps: MapSet, drives: int) -> list[float]:
 
 
 def _misfit(maps: MapSet, drive: Readings) -> float:
-    if len(drive) < ENOUGH:
+    if len(drive) < LEAST_READINGS:
         return 0.0
-    size = min(LENGTH, len(drive))
+    size = min(STRETCH_READINGS, len(drive))
     found = []
-    for begin in np.unique(np.linspace(0, len(drive) - size, STRETCHES).astype(int)):
+    for begin in np.unique(np.linspace(0, len(drive) - size, MOST_STRETCHES).astype(int)):
         stretch = drive.select(slice(begin, begin + size))
         own = Mapper(maps.parameters).run(stretch)
         of_all = ForwardModel(stretch, maps.grid, maps.parameters.model, maps.normals).log_likelihood(maps.ml)
@@ -57,11 +57,12 @@ def fit_warnings(maps: MapSet, names: Sequence[str]) -> list[str]:
         return []
     found = misfits(maps, len(names))
     worst = max(found)
-    if worst < WORSE:
+    if worst < LEAST_MISFIT:
         return []
-    odd = sorted((k for k in range(len(names)) if found[k] >= max(ALIKE * worst, WORSE)), key=lambda k: -found[k])
-    listed = ', '.join(f'{names[k]} ({found[k]:.2f})' for k in odd[:NAMED])
-    more = f' and {len(odd) - NAMED} more' if len(odd) > NAMED else ''
+    least = max(NAMED_FRACTION * worst, LEAST_MISFIT)
+    odd = sorted((k for k in range(len(names)) if found[k] >= least), key=lambda k: -found[k])
+    listed = ', '.join(f'{names[k]} ({found[k]:.2f})' for k in odd[:MOST_NAMED])
+    more = f' and {len(odd) - MOST_NAMED} more' if len(odd) > MOST_NAMED else ''
     who = f'{listed}{more} {"does" if len(odd) == 1 else "do"} not fit the map of all drives'
     if len(odd) == len(names):
         who = f'the drives {listed}{more} do not fit each other'

@@ -34,11 +34,11 @@ Watch = Callable[[str, Progress | None], None]
 
 FEW_READINGS = 200
 """Fewer readings with information about a value give a warning."""
-MUCH_CHANCE = 0.3
+LARGE_P_RAND = 0.3
 """A larger learned p_rand gives a warning."""
 LIKELIHOOD_DROP = 0.01
 """Nats a reading by which a new map may be less likely than the one before, at the same values, without a warning."""
-SURE = 1.0
+LEAST_STANDARD_ERRORS = 1.0
 """Standard errors by which held-out readings must be likelier with the map of learned values: the rule of one standard
 error in cross-validation, by which the simpler model is kept unless another one is better by more than that."""
 _UPDATES = 100
@@ -101,7 +101,8 @@ class CrossValidation(NamedTuple):
     def better(self) -> bool:
         """Whether the map of the learned values is significantly better, with both the first and the learned values."""
         at_first, at_learned = self.gains
-        return at_first > SURE * self.error_at_first and at_learned > SURE * self.error_at_learned
+        least = LEAST_STANDARD_ERRORS
+        return at_first > least * self.error_at_first and at_learned > least * self.error_at_learned
 
     @property
     def gains(self) -> tuple[float, float]:
@@ -153,7 +154,7 @@ def settle(forward: ForwardModel, occupied: NDArray[Any]) -> ModelParameters:
     return dataclasses.replace(model, p_lost=0.0) if model.p_lost < _NO_LOSS else model
 
 
-class Runs(Protocol):
+class MapMaker(Protocol):
     """Makes maps of readings: `Mapper`, or `TiledMapper`."""
 
     def run(self, readings: Readings, watch: Watch) -> MapSet:
@@ -165,7 +166,7 @@ def map_and_learn(
     parameters: Parameters,
     rounds: int,
     watch: Watch = lambda stage, progress: None,
-    mapper: Callable[[Parameters], Runs] = Mapper,
+    mapper: Callable[[Parameters], MapMaker] = Mapper,
 ) -> MapSet:
     """Return the maps after `rounds` rounds with one update of the model each, without checks of the result.
 
@@ -312,7 +313,7 @@ def _value_warnings(found: dict[str, ParameterEstimate], model: ModelParameters)
             warnings.append(f'{name} = {estimate.value:.3g} has no standard error: {estimate.bound}')
         if estimate.readings < FEW_READINGS and not (name == 'p_lost' and model.p_lost == 0):
             warnings.append(f'only {estimate.readings:.0f} readings inform {name}; it is only a rough estimate')
-    if found and model.p_rand > MUCH_CHANCE:
+    if found and model.p_rand > LARGE_P_RAND:
         warnings.append(
             f'p_rand = {model.p_rand:.2f} is more than the random measurements of a working sonar: look for a broken '
             'sensor, a wrong sensor pose, odometry that drifts, or people around the robot'

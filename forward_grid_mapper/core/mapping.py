@@ -53,7 +53,7 @@ def _stage(name: str) -> Callable[[Callable[Concatenate[Mapper, P], R]], Callabl
 
 
 @dataclass(frozen=True)
-class _Given:
+class _StageInput:
     """The input of all stages of a run.
 
     Attributes
@@ -127,14 +127,14 @@ class Mapper:
             # it may take gigabytes, and callers may keep this object
             self._evidence = None
 
-    def _prepare(self, readings: Readings) -> _Given:
+    def _prepare(self, readings: Readings) -> _StageInput:
         readings, p = in_canonical_order(readings), self._parameters
         # the grid of the standard map, so that all three maps have the same shape
         grid = map_grid(readings, p)
-        return _Given(readings, grid, traversed_cells(readings, grid))
+        return _StageInput(readings, grid, traversed_cells(readings, grid))
 
     @_stage('index')
-    def _index(self, given: _Given, start: tuple[Grid, NDArray[np.int8]] | None) -> Evidence:
+    def _index(self, given: _StageInput, start: tuple[Grid, NDArray[np.int8]] | None) -> Evidence:
         p = self._parameters
         memory, threads = memory_for_pairs(p), p.search.threads or cores()
         occupied = None if start is None else (part_of(*start, given.grid) == 1).astype(np.uint8)
@@ -143,25 +143,25 @@ class Mapper:
         return evidence
 
     @_stage('search')
-    def _search(self, given: _Given, evidence: Evidence) -> SearchResult:
+    def _search(self, given: _StageInput, evidence: Evidence) -> SearchResult:
         self._evidence = evidence
         search = Search(evidence, self._parameters.search, given.traversed.ravel())
         return search.run(lambda progress: self._watch('search', progress))
 
     @_stage('standard map')
-    def _standard_map(self, given: _Given) -> NDArray[np.float32]:
+    def _standard_map(self, given: _StageInput) -> NDArray[np.float32]:
         live = LogOddsMap(self._parameters)
         live.add(given.readings)
         return live.probability(given.grid)
 
     @_stage('post-processing')
-    def _final_maps(self, given: _Given, evidence: Evidence) -> FinalMaps:
+    def _final_maps(self, given: _StageInput, evidence: Evidence) -> FinalMaps:
         return final_maps(evidence, self._parameters.search, given.traversed)
 
     @_stage('uncertainty')
     def _evaluate(
         self,
-        given: _Given,
+        given: _StageInput,
         evidence: Evidence,
         found: SearchResult,
         live: NDArray[np.float32],

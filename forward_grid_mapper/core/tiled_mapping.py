@@ -152,7 +152,7 @@ class TiledMapper:
         self._visit('search', mosaic, mosaic.filled, search_alone, first, mosaic.first_input_of)
         while mosaic.schedule.stale:
             for colour in mosaic.tiling.colours:
-                if numbers := mosaic.schedule.of(colour):
+                if numbers := mosaic.schedule.stale_of(colour):
                     self._visit('search', mosaic, numbers, search_with_neighbours, improve)
         return not open_ends
 

@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from ..core.common.constants import THROUGH
 from ..core.common.errors import OutputError
 from ..core.common.grid import UNKNOWN, Grid
-from ..core.maps.cell_evidence import HERE, NOTHING, prior_odds
+from ..core.maps.cell_evidence import END_SIGMAS, ROUNDING, prior_odds
 from ..core.maps.map_set import MapSet
 from ..core.maps.moments import moments
 from ..core.maps.reading_causes import likeliest_causes
@@ -163,8 +163,8 @@ def page_data(
             'exponent': model.likelihood_exponent,
             'surface_offset': model.surface_offset,
             'cut': CUT,
-            'here': HERE,
-            'nothing': NOTHING,
+            'here': END_SIGMAS,
+            'nothing': ROUNDING,
             'through': THROUGH,
             'cos2_limit': maps.normals.cos2_limit if len(maps.normals.known) else 0.0,
         },

@@ -10,7 +10,7 @@ from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from ..core.messages.extrinsics import STEEP
 from ..core.messages.mounts import far_mounts
 from ..core.messages.pose_association import PoseAssociator
-from ..core.messages.rep117 import OF_POSES, REASONS, sensor_rejections
+from ..core.messages.rep117 import REASONS, REASONS_OUTSIDE_MESSAGE, sensor_rejections
 from ..core.messages.sensor_records import MOST_FRAMES
 from . import diagnostics
 from .background import Worker
@@ -88,7 +88,7 @@ class Reporter:
         counts = self._associator.buffer.counts()
         limits = [
             *self._associator.message_warnings(),
-            *sensor_rejections(self._associator.rejected_by_frame, counts, OF_POSES),
+            *sensor_rejections(self._associator.rejected_by_frame, counts, REASONS_OUTSIDE_MESSAGE),
         ]
         # faults of frames are logged by the functions that detect them
         silent = statuses[0].message == no_map_frame or statuses[0].message.startswith(diagnostics.NO_POSE)

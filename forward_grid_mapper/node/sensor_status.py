@@ -8,7 +8,7 @@ from diagnostic_msgs.msg import DiagnosticStatus
 
 from ..core.common.words import counted
 from ..core.learning.sensor_health import SensorHealth, health_warning
-from ..core.messages.rep117 import NONE
+from ..core.messages.rep117 import MOST_NO_ECHO
 from .diagnostics import listed, status
 
 PAUSES, ENOUGH, RARE = 5, 100, 1000
@@ -27,7 +27,7 @@ def unsent_warning(pauses: int, counts: Mapping[str, tuple[int, int]]) -> str:
         From `ReadingBuffer.counts`.
     """
     readings, silent = (sum(numbers[k] for numbers in counts.values()) for k in (0, 1))
-    if pauses < max(PAUSES, readings / RARE) or readings < ENOUGH or silent > NONE * readings:
+    if pauses < max(PAUSES, readings / RARE) or readings < ENOUGH or silent > MOST_NO_ECHO * readings:
         return ''
     return (
         f'sensors stopped sending for half a second or more, and sent again, {pauses} times so far, and hardly any '

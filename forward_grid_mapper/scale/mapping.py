@@ -213,7 +213,7 @@ class ScaledMapper:
             rounds += 1
             for k, colour in enumerate(colours, 1):
                 step += 1
-                if numbers := schedule.of(colour):
+                if numbers := schedule.stale_of(colour):
                     name = f'search, round {rounds}, colour {k} of {len(tiling.colours)}'
                     now = self._each('search', search, numbers, step, name=name)
                     for number, outcome in now:

@@ -138,7 +138,7 @@ def layers_in(job: Job, box: Grid) -> dict[str, NDArray[Any]]:
     out: dict[str, NDArray[Any]] = {
         name: np.full(box.shape, UNKNOWN if kind is np.int8 else np.nan, kind) for name, (_, kind) in LAYERS.items()
     }
-    for number in tiling.meeting(box):
+    for number in tiling.with_cores_in(box):
         tile = tiling.tiles[number]
         part = common_part(tile.core, box)
         found = read_arrays(job.folder.tile(tile.row, tile.column, 'maps.npz'), *(own for own, _ in LAYERS.values()))

@@ -86,7 +86,7 @@ class TileFiles:
 
     def _cores(self, file: str, name: str, box: Grid, out: NDArray[Any]) -> NDArray[Any]:
         """Fill an array of a box with the data of the tiles in it."""
-        for number in self.tiling.meeting(box):
+        for number in self.tiling.with_cores_in(box):
             core = self.tiling.tiles[number].core
             part = common_part(core, box)
             try:
@@ -101,7 +101,7 @@ class TileFiles:
         """Return the map in a box: the windows of all searches in order; those of the same step do not overlap."""
         out = np.zeros(box.shape, np.uint8)
         found = []
-        for number in self.tiling.meeting(box, window=True):
+        for number in self.tiling.with_windows_in(box):
             steps = [s for s in self._steps(number) if step is None or s < step]
             # the result of a first search outside of its core is not used, so the first one is always below the others
             found += [(s, number) for s in {min(steps), max(steps)}] if steps else []

@@ -11,7 +11,7 @@ import pytest
 
 from forward_grid_mapper.core.common.parameters import Parameters
 from forward_grid_mapper.core.common.readings import Readings, drives_of, in_canonical_order, of_drives
-from forward_grid_mapper.core.drive_fit import WORSE, fit_warnings, misfits
+from forward_grid_mapper.core.drive_fit import LEAST_MISFIT, fit_warnings, misfits
 from forward_grid_mapper.core.mapping import Mapper
 from forward_grid_mapper.core.maps.map_set import MapSet
 from forward_grid_mapper.simulation.drive import drive
@@ -43,7 +43,7 @@ def mapped(*drives: Readings) -> MapSet:
 
 def test_drives_that_fit_give_no_warning() -> None:
     maps = mapped(*(tour(seed) for seed in range(3)))
-    assert max(misfits(maps, 3)) < WORSE / 2
+    assert max(misfits(maps, 3)) < LEAST_MISFIT / 2
     assert fit_warnings(maps, ['a', 'b', 'c']) == []
 
 

@@ -17,7 +17,7 @@ from ..common.parameter_groups import ModelParameters
 from ..common.readings import Floats, Readings
 from ..runtime.cancelling import NEVER
 from ..sensor.cone_table import cone_table
-from ..sensor.surface_normals import SurfaceNormals, no_normals, on_larger_grid, touched
+from ..sensor.surface_normals import SurfaceNormals, no_normals, on_larger_grid, window_of_influence
 from .fixed_point import QUANTUM
 from .indexed_readings import IndexedReadings, empty_maps
 from .indexing import ALLOCATED_WORDS, LARGEST_CONE, UNUSED_WORDS, reading_state_table
@@ -293,7 +293,7 @@ class Evidence(IndexedReadings):
             return None
         s, shape = self.state, self.grid.shape
         # readings affect the normals around them, and these the limits of the incidence angle around them
-        around = touched(touched(self._not_renewed, self.grid), self.grid)
+        around = window_of_influence(window_of_influence(self._not_renewed, self.grid), self.grid)
         normals = renewed_normals(s, self._size, self.grid, self.model, self._bearing_sums, around)
         differ = np.zeros(shape, np.uint8)
         changed = np.zeros(self._size, np.uint8)

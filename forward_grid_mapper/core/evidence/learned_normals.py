@@ -11,7 +11,7 @@ from ..common.grid import Grid, Window
 from ..common.parameter_groups import ModelParameters
 from ..runtime.cancelling import NEVER
 from ..sensor.incidence import count, edges_of, narrowed, no_counts, slots_of, with_own_angles
-from ..sensor.surface_normals import SurfaceNormals, gather, normals_of, renewed, touched
+from ..sensor.surface_normals import SurfaceNormals, gather, normals_of, renewed, window_of_influence
 from .renewal import near
 from .state import State, Work
 
@@ -79,7 +79,7 @@ def renewed_normals(
         Of all these readings.
     window : first row, last one plus one, and columns likewise
     """
-    around = touched(window, grid)
+    around = window_of_influence(window, grid)
     normals, edges = renewed(s.normals, sums, grid, around), edges_of(model)
     if edges is None:
         return normals

@@ -6,7 +6,7 @@ import numpy as np
 
 from ..common.parameters import Parameters
 from ..common.readings import Readings
-from .trial_maps import coarse, thinned, trial_map
+from .trial_maps import coarse_parameters, randomly_thinned, trial_map
 
 MOST, ENOUGH = 8000, 1000
 """Most readings that are used; with fewer than the second, nothing can be said."""
@@ -18,11 +18,11 @@ def contradiction(readings: Readings, parameters: Parameters) -> float:
     A map of its own fits each half a little better anyway, and much better if the halves do not agree. If no place is
     seen in both halves, nothing is contradicted.
     """
-    readings = thinned(readings.select(np.argsort(readings.stamp, kind='stable')), MOST)
+    readings = randomly_thinned(readings.select(np.argsort(readings.stamp, kind='stable')), MOST)
     echoes, middle = int(np.count_nonzero(readings.echo)), len(readings) // 2
     if len(readings) < ENOUGH or not echoes:
         return 0.0
-    p = coarse(parameters, readings)
+    p = coarse_parameters(parameters, readings)
     parts = (readings.select(slice(middle)), readings.select(slice(middle, None)))
     apart = sum(float(trial_map(part, p).blocks.sum()) for part in parts)
     return (apart - float(trial_map(readings, p).blocks.sum())) / echoes

@@ -32,10 +32,10 @@ from .sensor_calibration import (
     YAW,
     OffsetEstimate,
     Quantity,
-    as_good,
+    hardly_distinguishable,
     offset_estimates,
 )
-from .trial_maps import MountedReadings, coarse, trial_map
+from .trial_maps import MountedReadings, coarse_parameters, trial_map
 
 MOST_READINGS, LEAST_READINGS = 800, 300
 """Most readings of the part that is mapped; with fewer than the second, no check is made."""
@@ -110,7 +110,7 @@ def consistency_warnings(
         return [warning]
     parameters = parameters or Parameters()
     part = drive.moving_part(MOST_READINGS)
-    p = coarse(parameters, part.readings)
+    p = coarse_parameters(parameters, part.readings)
     count, given = len(part), trial_map(part.readings, p).objective
     tried = ((trial_map(fault.undone, p).objective - given, fault) for fault in _faults(part))
     gain, fault = max(tried, key=itemgetter(0))
@@ -123,8 +123,8 @@ def consistency_warnings(
 
 def _significant_offsets(drive: MountedReadings, parameters: Parameters, known: float) -> list[OffsetEstimate]:
     """Return the significant offsets that may explain the readings better than by `known`, nats a reading."""
-    part = drive.moving_part(OFFSET_PART).thinned(OFFSET_READINGS)
-    p = coarse(parameters, part.readings)
+    part = drive.moving_part(OFFSET_PART).randomly_thinned(OFFSET_READINGS)
+    p = coarse_parameters(parameters, part.readings)
     given, suspects = trial_map(part.readings, p).objective, {}
     for quantity in QUANTITIES:
         tried = ((trial_map(quantity.corrected(part, guess), p).objective, guess) for guess in quantity.guesses)
@@ -142,7 +142,7 @@ def _explained(warning: str, count: int, gain: float) -> str:
 def _offset_warning(found: list[OffsetEstimate], time_offset: float) -> str:
     """Return the warning about the best of the estimates; `time_offset` is the one already added to stamps, seconds."""
     best, *others = found
-    causes = [best, *(each for each in others if as_good(best, each))]
+    causes = [best, *(each for each in others if hardly_distinguishable(best, each))]
     said = ', or '.join(_words(each.quantity, each.value, each.error) for each in causes)
     remedies = []
     for each in causes:

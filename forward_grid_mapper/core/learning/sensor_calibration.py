@@ -21,7 +21,7 @@ import numpy as np
 
 from ..common.parameters import Parameters
 from ..common.readings import Floats, Readings
-from .trial_maps import BLOCKS, MountedReadings, TrialMap, coarse, trial_map
+from .trial_maps import BLOCKS, MountedReadings, TrialMap, coarse_parameters, trial_map
 
 MOST_READINGS = 4000
 """Most readings of the maps from which a value is estimated."""
@@ -122,7 +122,7 @@ def offset_estimates(
     parameters : Parameters
     """
     part = drive.moving_part(MOST_READINGS)
-    p = coarse(parameters, part.readings)
+    p = coarse_parameters(parameters, part.readings)
     given = trial_map(part.readings, p)
     found = [_estimate(part, quantity, guess, given, p) for quantity, guess in suspects.items()]
     wrong = [each for each in found if each and each.significant]
@@ -135,7 +135,7 @@ def offset_estimates(
     return sorted((each for each in wrong if each.significant), key=lambda each: -each.gain)
 
 
-def as_good(best: OffsetEstimate, other: OffsetEstimate) -> bool:
+def hardly_distinguishable(best: OffsetEstimate, other: OffsetEstimate) -> bool:
     """Return whether the drive hardly tells which of two quantities is wrong: at constant speed, late is behind."""
     return other.gain >= AS_GOOD_SHARE * best.gain or _sigmas(best.best.blocks - other.best.blocks) < SIGMAS - 1
 

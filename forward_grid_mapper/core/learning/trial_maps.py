@@ -83,8 +83,8 @@ class MountedReadings:
         first = int(np.argmax(moved[most - 1 :] - moved[: count - most + 1]))
         return self.part(slice(first, first + most))
 
-    def thinned(self, most: int) -> MountedReadings:
-        """Return at most this many of the readings (`thinned`)."""
+    def randomly_thinned(self, most: int) -> MountedReadings:
+        """Return at most this many of the readings (`randomly_thinned`)."""
         return self if len(self) <= most else self.part(_few(len(self), most))
 
     def travel(self) -> tuple[NDArray[np.int64], Floats]:
@@ -137,7 +137,7 @@ class TrialMap(NamedTuple):
     blocks: Floats
 
 
-def thinned(readings: Readings, most: int) -> Readings:
+def randomly_thinned(readings: Readings, most: int) -> Readings:
     """Return at most this many readings, chosen at random, so that no sensor is preferred."""
     return readings if len(readings) <= most else readings.select(_few(len(readings), most))
 
@@ -147,7 +147,7 @@ def _few(count: int, most: int) -> NDArray[np.int64]:
     return np.sort(np.random.default_rng(0).choice(count, most, replace=False))
 
 
-def coarse(parameters: Parameters, readings: Readings) -> Parameters:
+def coarse_parameters(parameters: Parameters, readings: Readings) -> Parameters:
     """Return the parameters of the small maps, with coarse cells if ranges are long."""
     reach = float(np.quantile(readings.z, 0.9))
     cell = max(parameters.grid.resolution, CELL, reach / REACH)

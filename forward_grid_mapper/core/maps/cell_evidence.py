@@ -19,13 +19,13 @@ from ..sensor.surface_normals import SurfaceNormals
 from .line_of_sight import in_line_of_sight
 from .traversed import traversed_cells
 
-NOTHING = 1e-9
+ROUNDING = 1e-9
 """Log-likelihood ratios up to this, nats, are rounding errors."""
 
-MARGIN = 3.0
+MARGIN_CELLS = 3.0
 """Cells around the cell within which cones are examined: its neighbours, and rounding."""
 
-HERE = 2.0
+END_SIGMAS = 2.0
 """Largest distance between the range of a reading and the cell in which it ends, σ."""
 
 
@@ -46,7 +46,7 @@ class CellEvidence:
     distance : float64, shape (N,)
         From the sensor to the surface that an obstacle in the cell would have, metres.
     ends_here : bool, shape (N,)
-        Whether the range is within `HERE` σ of that; other readings reach farther, or end before it.
+        Whether the range is within `END_SIGMAS` σ of that; other readings reach farther, or end before it.
     silent : bool, shape (N,)
         Max-range readings.
     through_wall : bool, shape (N,)
@@ -114,9 +114,9 @@ def cell_evidence(
     distance = np.hypot(u, v)
     along, across = u * cones['axis_x'] + v * cones['axis_y'], u * cones['axis_y'] - v * cones['axis_x']
     # cones that may contain the cell or a neighbour; a cone contains the cells on its axis, however narrow it is
-    near = (along >= cones['cosine'] * distance) | (np.abs(across) <= MARGIN) | (distance <= MARGIN)
+    near = (along >= cones['cosine'] * distance) | (np.abs(across) <= MARGIN_CELLS) | (distance <= MARGIN_CELLS)
     outside = np.maximum(cones['cosine'] * np.abs(across) - cones['sine'] * along, 0.0)
-    which = np.flatnonzero((near | (outside <= MARGIN)) & (distance <= cones['reach'] + MARGIN))
+    which = np.flatnonzero((near | (outside <= MARGIN_CELLS)) & (distance <= cones['reach'] + MARGIN_CELLS))
     forward = ForwardModel(readings.select(which), grid, model, normals, cones[which])
     occupied = (ml == 1).astype(np.int8)
     occupied[row, column] = 1
@@ -126,7 +126,7 @@ def cell_evidence(
     occupied[max(row - 1, 0) : row + 2, max(column - 1, 0) : column + 2] = 0
     wall = model.likelihood_exponent * float((with_it - forward.expectations(occupied).log_likelihood).sum())
     order = np.argsort(-np.abs(nats), kind='stable')
-    order = order[np.abs(nats[order]) > NOTHING]
+    order = order[np.abs(nats[order]) > ROUNDING]
     which, nats = which[order], nats[order]
     traversed = traversed_cells(readings, grid)
     lattice, walls = Lattice(grid.height, grid.width, grid.resolution), (ml == 1).ravel()
@@ -140,7 +140,7 @@ def cell_evidence(
         readings=which,
         nats=nats,
         distance=(distance[which] - model.surface_offset) * grid.resolution,
-        ends_here=(error <= HERE * cones['sigma'][which]) & readings.echo[which],
+        ends_here=(error <= END_SIGMAS * cones['sigma'][which]) & readings.echo[which],
         silent=~readings.echo[which],
         through_wall=np.array(blocked, np.bool_),
         wall=wall,

@@ -18,26 +18,26 @@ from .sensor_records import record_of
 SAMPLES = 256
 """Most messages of a sensor that are sampled; they are spread over the whole drive."""
 
-ENOUGH = 30
+LEAST_MESSAGES = 30
 """Fewest messages for a check."""
 
-BEYOND = 1.1
+BEYOND_RATIO = 1.1
 """A range is beyond max_range if it is this many times as large; many drivers send a little more for 'no echo'."""
 
-MANY, MANY_OF_ONE = 0.15, 0.3
+MANY_OF_ALL, MANY_OF_ONE = 0.15, 0.3
 """Fractions of the finite ranges that are beyond max_range, or below min_range, if units differ: of all sensors, which
 may be of several kinds, also without the one with the most such ranges; and of one sensor."""
 
-SENTINEL = 0.5
+SENTINEL_SHARE = 0.5
 """If one value has this fraction of the ranges beyond, the driver sends it for 'no echo'."""
 
 LONGEST_RANGE = 100.0
 """Metres; no sonar measures so far, and hardly any other Range sensor."""
 
-NEAR = 0.2
+REACHED_SHARE = 0.2
 """If all ranges are within this fraction of such a max_range, only max_range is wrong."""
 
-STATED = 1e6
+LARGEST_STATED = 1e6
 """From this value on, max_range is taken as not stated: drivers send the largest number."""
 
 UNITS = {'feet': 3.281, 'inches': 39.37, 'centimetres': 100.0, 'millimetres': 1000.0}
@@ -130,9 +130,9 @@ class LimitWatch:
         """
         values = np.concatenate([np.empty((0, 3)), *(samples.values for samples in self._of.values())])
         finite = values[_usable(values)].T
-        if len(finite[0]) < ENOUGH or _middle(finite[2]) >= STATED:
+        if len(finite[0]) < LEAST_MESSAGES or _middle(finite[2]) >= LARGEST_STATED:
             return ''
-        return _far(finite)
+        return _limits_too_large(finite)
 
 
 def _usable(values: Floats) -> NDArray[np.bool_]:
@@ -152,7 +152,7 @@ def _suspicion(values: Floats, sensor: NDArray[np.int64] | None = None) -> str:
         The sensor of each, if they are those of all sensors.
     """
     used = _usable(values)
-    if np.count_nonzero(used) < ENOUGH:
+    if np.count_nonzero(used) < LEAST_MESSAGES:
         return ''
     finite = values[used].T
     if sensor is not None:
@@ -161,7 +161,7 @@ def _suspicion(values: Floats, sensor: NDArray[np.int64] | None = None) -> str:
         # the others have no ranges to compare with
         sensor = None if several and np.ptp(sensor) == 0 else sensor
     # one cause has several symptoms; the first that is reported is enough
-    return _beyond(finite, sensor) or _far(finite) or _below(finite, sensor)
+    return _larger_than_limits(finite, sensor) or _limits_too_large(finite) or _smaller_than_limits(finite, sensor)
 
 
 def _are_many(found: NDArray[np.bool_], sensor: NDArray[np.int64] | None) -> bool:
@@ -173,19 +173,19 @@ def _are_many(found: NDArray[np.bool_], sensor: NDArray[np.int64] | None) -> boo
     by_sensor, of_sensor = np.bincount(sensor[found], minlength=1), np.bincount(sensor)
     most = int(by_sensor.argmax())
     rest = len(found) - of_sensor[most]
-    return bool(count >= MANY * len(found) and count - by_sensor[most] >= MANY * rest)
+    return bool(count >= MANY_OF_ALL * len(found) and count - by_sensor[most] >= MANY_OF_ALL * rest)
 
 
-def _beyond(samples: Floats, sensor: NDArray[np.int64] | None) -> str:
+def _larger_than_limits(samples: Floats, sensor: NDArray[np.int64] | None) -> str:
     ranges, _, limits = samples
-    beyond = ranges > BEYOND * limits
+    beyond = ranges > BEYOND_RATIO * limits
     counts = np.unique(ranges[beyond], return_counts=True)[1]
     count = int(counts.sum())
-    if not _are_many(beyond, sensor) or counts.max() > SENTINEL * count:
+    if not _are_many(beyond, sensor) or counts.max() > SENTINEL_SHARE * count:
         return ''
     # no echo comes from beyond max_range, whatever its unit
-    ratio = _at(0.98, (ranges / limits)[beyond])
-    unit = next((name for name, count in UNITS.items() if ratio < BEYOND * count), 'millimetres')
+    ratio = _quantile(0.98, (ranges / limits)[beyond])
+    unit = next((name for name, count in UNITS.items() if ratio < BEYOND_RATIO * count), 'millimetres')
     return (
         f'{count} of {len(ranges)} examined ranges are larger than max_range ({_middle(limits):g} m), up to '
         f'{ratio:.0f} times as large, and so are treated as no echo: are the ranges in {unit} and the limits in '
@@ -193,7 +193,7 @@ def _beyond(samples: Floats, sensor: NDArray[np.int64] | None) -> str:
     )
 
 
-def _below(samples: Floats, sensor: NDArray[np.int64] | None) -> str:
+def _smaller_than_limits(samples: Floats, sensor: NDArray[np.int64] | None) -> str:
     ranges, least, limits = samples
     # limits that contradict each other are rejected for that
     below = (ranges < least) & (least < limits)
@@ -211,13 +211,13 @@ def _below(samples: Floats, sensor: NDArray[np.int64] | None) -> str:
     )
 
 
-def _far(samples: Floats) -> str:
+def _limits_too_large(samples: Floats) -> str:
     ranges, _, limits = samples
     limit = _middle(limits)
     if limit < LONGEST_RANGE:
         return ''
     # in a corridor most ranges are short
-    large = _at(0.9, ranges)
+    large = _quantile(0.9, ranges)
     if large > LONGEST_RANGE:
         return (
             f'a tenth of the ranges is larger than {large:.0f} m, and max_range is {limit:.4g} m, farther than sonars '
@@ -225,9 +225,9 @@ def _far(samples: Floats) -> str:
             'the driver'
         )
     farthest = ranges[ranges < limits].max(initial=0.0)
-    if farthest > NEAR * limit:
+    if farthest > REACHED_SHARE * limit:
         return ''
-    cause = 'is it in centimetres or millimetres' if limit < STATED else 'does the driver state no limit'
+    cause = 'is it in centimetres or millimetres' if limit < LARGEST_STATED else 'does the driver state no limit'
     return (
         f'max_range is {limit:.4g} m, and no range is larger than {farthest:.1f} m: {cause}? A reading without an '
         'echo is evidence for free space up to max_range; correct the driver, or set the parameter max_range'
@@ -238,6 +238,6 @@ def _middle(values: Floats) -> float:
     return float(np.sort(values)[len(values) // 2])
 
 
-def _at(part: float, values: Floats) -> float:
+def _quantile(part: float, values: Floats) -> float:
     """Return the quantile `part` of values."""
     return float(np.sort(values)[int(part * (len(values) - 1))])

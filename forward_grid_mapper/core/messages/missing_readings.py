@@ -28,7 +28,7 @@ EDGE_LIST: list[int] = EDGES.tolist()
 MIDDLES = np.sqrt(EDGES[:-1].astype(np.float64) * EDGES[1:])
 """Nanoseconds that stand for the intervals of each pair of edges."""
 
-PERIODS = 3.5
+PAUSE_PERIODS = 3.5
 """A pause is an interval of at least this many periods."""
 
 SLOWEST_SOUND = 300.0
@@ -37,16 +37,16 @@ SLOWEST_SOUND = 300.0
 LONGEST_SONAR_RANGE = 20.0
 """Metres; no sonar waits for an echo from farther away, so a larger max_range is in another unit or not stated."""
 
-ENOUGH = 100
+LEAST_INTERVALS = 100
 """Fewest intervals of a sensor."""
 
-MISSING = 0.15
+LEAST_PAUSE_SHARE = 0.15
 """Fraction of its time for which a sensor pauses and others do not."""
 
-SENSORS = 2
+LEAST_SENSORS = 2
 """Fewest such sensors; a single one may have a bad contact."""
 
-NONE = 0.002
+MOST_NO_ECHO = 0.002
 """Largest fraction of readings without an echo, if they are left out."""
 
 
@@ -93,7 +93,7 @@ class MissingReadings:
 
     def clear(self) -> None:
         """Forget all messages."""
-        self._of: dict[str, _Intervals] = {}
+        self._by_frame: dict[str, _Intervals] = {}
         self._together = _Intervals()
         self._count = self._silent = 0
         self._largest_max_range = 0.0
@@ -105,7 +105,7 @@ class MissingReadings:
         if self._largest_max_range < message.max_range < LONGEST_SONAR_RANGE:
             self._largest_max_range = message.max_range
         self._together.add(message.stamp)
-        if own := record_of(self._of, message.frame_id, _Intervals):
+        if own := record_of(self._by_frame, message.frame_id, _Intervals):
             own.add(message.stamp)
 
     def add_all(self, messages: Ranges) -> None:
@@ -118,22 +118,22 @@ class MissingReadings:
         )
         self._together.add_all(messages.stamp)
         for frame, part in messages.of_each():
-            if own := record_of(self._of, frame, _Intervals):
+            if own := record_of(self._by_frame, frame, _Intervals):
                 own.add_all(messages.stamp[part])
 
     def warnings(self) -> list[str]:
         """Return a warning; empty if there is no suspicion."""
-        if self._silent > NONE * self._count:
+        if self._silent > MOST_NO_ECHO * self._count:
             return []
         missing = {}
-        waiting = len(self._of) * 2.0 * self._largest_max_range / SLOWEST_SOUND * NANOSECONDS
-        for frame, own in self._of.items():
-            if own.counts.sum() >= ENOUGH:
-                pause = max(PERIODS * own.period, own.period + waiting)
+        waiting = len(self._by_frame) * 2.0 * self._largest_max_range / SLOWEST_SOUND * NANOSECONDS
+        for frame, own in self._by_frame.items():
+            if own.counts.sum() >= LEAST_INTERVALS:
+                pause = max(PAUSE_PERIODS * own.period, own.period + waiting)
                 # while all sensors pause, the driver has stopped
                 missing[frame] = (own.longer(pause) - self._together.longer(pause)) / own.longer(0.0)
-        found = sorted(frame for frame, part in missing.items() if part > MISSING)
-        if len(found) < SENSORS:
+        found = sorted(frame for frame, part in missing.items() if part > LEAST_PAUSE_SHARE)
+        if len(found) < LEAST_SENSORS:
             return []
         names, most = ', '.join(found[:3]), max(missing.values())
         more = f' and {len(found) - 3} more' if len(found) > 3 else ''

@@ -68,24 +68,24 @@ REASONS = {
 """Why a reading is rejected, in words."""
 
 
-MANY = 0.2
+MANY_REJECTED = 0.2
 """Fraction of the readings whose rejection for one reason gives a warning."""
 
 
-NEARLY_ALL, ENOUGH = 0.9, 30
+NEARLY_ALL, LEAST_READINGS = 0.9, 30
 """Fraction of the readings of one sensor whose rejection for one reason gives a warning, however few they are among
 all; and their least number."""
 
 
-OF_SILENCE, INSTEAD, NONE = ('nan_range', 'too_near', 'below_min_range'), 0.05, 0.01
+NO_ECHO_REASONS, NO_ECHO_REJECTED, MOST_NO_ECHO = ('nan_range', 'too_near', 'below_min_range'), 0.05, 0.01
 """Reasons for which values that drivers send for 'no echo' are rejected. If at least the first fraction of the readings
 of most sensors is rejected so, and at most the second fraction of all others has no echo, they stand for it."""
 
-SEVERAL = 2
+LEAST_NAN_SENSORS = 2
 """This many sensors suffice for NaN: a single one may be broken."""
 
 
-OF_POSES = {
+REASONS_OUTSIDE_MESSAGE = {
     'unknown_extrinsics',
     'late_transform',
     'steep_sensor',
@@ -103,7 +103,7 @@ OF_POSES = {
 """Reasons that are not in the message itself; a running node reports them elsewhere."""
 
 
-CHOSEN = {'over_range', 'paused'}
+CHOSEN_BY_USER = {'over_range', 'paused'}
 """Reasons that the user chose, which are no fault of a sensor: there may be no object in its direction."""
 
 
@@ -199,7 +199,7 @@ def rejection_warnings(
     return [
         f'{count} of {received} {what} were rejected as {reason}: {REASONS[reason]}'
         for reason, count in rejected.items()
-        if count > MANY * received and reason not in known
+        if count > MANY_REJECTED * received and reason not in known
     ]
 
 
@@ -220,21 +220,21 @@ def sensor_rejections(
         From `ReadingBuffer.counts`.
     """
     rejected: Counter[str] = sum(map(Counter, by_frame.values()), Counter())
-    many = MANY * (rejected.total() + sum(count for count, _ in accepted.values()))
+    many = MANY_REJECTED * (rejected.total() + sum(count for count, _ in accepted.values()))
     lost: dict[str, list[str]] = {}
     for frame, counts in by_frame.items():
         received = sum(counts.values()) + accepted.get(frame, (0, 0))[0]
         reason = max(counts, key=lambda each: counts[each])
-        reported = not frame or reason in CHOSEN or reason in known or rejected[reason] > many
-        if counts[reason] >= max(NEARLY_ALL * received, ENOUGH) and not reported:
+        reported = not frame or reason in CHOSEN_BY_USER or reason in known or rejected[reason] > many
+        if counts[reason] >= max(NEARLY_ALL * received, LEAST_READINGS) and not reported:
             lost.setdefault(reason, []).append(frame)
     if not set(accepted).difference(*lost.values()):
         return []
     return [
         f'nearly all readings of {", ".join(sorted(frames)[:8])}{f" and {len(frames) - 8} more" * (len(frames) > 8)} '
-        f'were rejected as {reason}: {_BROKEN if reason in OF_SILENCE else REASONS[reason]}'
+        f'were rejected as {reason}: {_BROKEN if reason in NO_ECHO_REASONS else REASONS[reason]}'
         for reason, frames in lost.items()
-    ] + _instead_of_no_echo(by_frame, accepted, rejected, {*lost, *(each for each in OF_SILENCE if each in known)})
+    ] + _instead_of_no_echo(by_frame, accepted, rejected, {*lost, *(each for each in NO_ECHO_REASONS if each in known)})
 
 
 def _instead_of_no_echo(
@@ -246,10 +246,10 @@ def _instead_of_no_echo(
     """Return a warning if the driver sends a value for 'no echo' that is rejected, even if that happens seldom."""
     used, silent = (sum(numbers[k] for numbers in accepted.values()) for k in (0, 1))
     received = used + sum(rejected.values())
-    if silent > NONE * used:
+    if silent > MOST_NO_ECHO * used:
         return []
     warnings = []
-    for reason in OF_SILENCE:
+    for reason in NO_ECHO_REASONS:
         count = rejected.get(reason, 0)
         # an object may be too near to some sensors for a while
         shares = [
@@ -258,12 +258,12 @@ def _instead_of_no_echo(
             # a sensor of which all readings were left out is known, but has no count
             if numbers[0] or by_frame.get(frame)
         ]
-        concerned, fewest = sum(share >= INSTEAD for share in shares), INSTEAD * received
+        concerned, fewest = sum(share >= NO_ECHO_REJECTED for share in shares), NO_ECHO_REJECTED * received
         enough = concerned > len(shares) / 2
         if reason == 'nan_range':
             # no object makes a range NaN, so a few sensors of a robot in a small room suffice
-            enough, fewest = concerned >= SEVERAL, 0.0
-        if enough and max(fewest, ENOUGH) <= count <= MANY * received and reason not in known:
+            enough, fewest = concerned >= LEAST_NAN_SENSORS, 0.0
+        if enough and max(fewest, LEAST_READINGS) <= count <= MANY_REJECTED * received and reason not in known:
             warnings.append(
                 f'{count} of {received} readings were rejected as {reason}, and no other reading is without an echo: '
                 f'does the driver send this if there is no echo? {_SILENT_DRIVER[0].upper()}{_SILENT_DRIVER[1:]}'

@@ -11,17 +11,17 @@ from collections.abc import Callable, Sequence
 
 from .message_batch import Ranges
 
-MOST = 20_000
+MOST_COMPARED = 20_000
 """Messages that are compared, from the start of the drive on."""
 
-ENOUGH = 30
+LEAST_PAIRS = 30
 """Fewest pairs of ranges for a warning."""
 
-SAME = 0.05
+COPY_TOLERANCE = 0.05
 """Metres by which a filtered range differs from the measured one at most in half of the cases: filters remove outliers.
 Ranges of two sensors in different directions are rarely so similar."""
 
-NAMED = 4
+MOST_NAMED = 4
 """Most frames that are named as examples."""
 
 
@@ -29,7 +29,7 @@ class RepeatedTopics:
     """Counts messages on different topics with the same frame and stamp, and warns if most ranges are the same."""
 
     def __init__(self) -> None:
-        self._left = MOST
+        self._left = MOST_COMPARED
         self._first: dict[tuple[str, int], tuple[str, float]] = {}
         self._seen: Counter[str] = Counter()
         # all pairs of messages, those with an echo, and those with nearly the same range, by both topics
@@ -51,7 +51,7 @@ class RepeatedTopics:
             self._frames.setdefault(both, {})[frame] = None
             if math.isfinite(metres) or math.isfinite(measured):
                 self._echoes[both] += 1
-                self._same[both] += abs(metres - measured) <= SAME
+                self._same[both] += abs(metres - measured) <= COPY_TOLERANCE
         if not self._left:
             self._first.clear()
 
@@ -71,17 +71,17 @@ class RepeatedTopics:
         for both in found:
             one, other = sorted(both, key=_derived)
             frames = list(self._frames[both])
-            more = f' and {len(frames) - NAMED} more' if len(frames) > NAMED else ''
+            more = f' and {len(frames) - MOST_NAMED} more' if len(frames) > MOST_NAMED else ''
             texts.append(
-                f'{one} and {other} contain the same readings (frame {", ".join(frames[:NAMED])}{more}: equal stamps, '
-                f'nearly equal ranges), and their evidence counts twice; is {other} a filtered copy? {kept}'
+                f'{one} and {other} contain the same readings (frame {", ".join(frames[:MOST_NAMED])}{more}: equal '
+                f'stamps, nearly equal ranges), and their evidence counts twice; is {other} a filtered copy? {kept}'
             )
         return texts
 
     def _are_copies(self, both: tuple[str, str], count: int) -> bool:
         echoes = self._echoes[both]
         fewer = min(self._seen[topic] for topic in both)
-        return echoes >= ENOUGH and 2 * self._same[both] >= echoes and 2 * count >= fewer
+        return echoes >= LEAST_PAIRS and 2 * self._same[both] >= echoes and 2 * count >= fewer
 
 
 def _derived(topic: str) -> tuple[bool, int, str]:

@@ -45,7 +45,7 @@ class Expectations:
     log_likelihood: Floats
 
 
-class _Given(NamedTuple):
+class _KernelInput(NamedTuple):
     """What the kernel needs besides the map; `pairing` and `normals` decide which surfaces a reading passes."""
 
     cones: Cones
@@ -72,7 +72,7 @@ def _sort(values: Any, n: int) -> None:
 
 
 @inlined_kernel
-def _distances(given: _Given, t: int, occupied: Any, out: Any) -> int:
+def _distances(given: _KernelInput, t: int, occupied: Any, out: Any) -> int:
     """Write the distances of the occupied cells of cone t, without surfaces beyond the limit of the incidence angle.
 
     Returns their number, even if `out` is too short.
@@ -97,7 +97,7 @@ def _distances(given: _Given, t: int, occupied: Any, out: Any) -> int:
 
 
 @allocating_kernel
-def _expect(given: _Given, occupied: Any, out: Any) -> None:
+def _expect(given: _KernelInput, occupied: Any, out: Any) -> None:
     """Fill `out` (8, N) with the rows of `Expectations`, in its order."""
     cones, causes = given.cones, given.causes
     distances = np.empty(1024)
@@ -176,7 +176,7 @@ class ForwardModel:
         """
         resolution, model = self.grid.resolution, self.model
         causes = causes_of(self.readings, self.cones['sigma'] * resolution, model, resolution)
-        given = _Given(self.cones, self._pairing, self.normals, causes, resolution)
+        given = _KernelInput(self.cones, self._pairing, self.normals, causes, resolution)
         out = np.empty((8, len(self.readings)))
         _expect(given, np.ascontiguousarray(np.asarray(occupied) == 1).view(np.uint8), out)
         return Expectations(*out)

@@ -39,7 +39,15 @@ from ..runtime.cancelling import NEVER
 from ..runtime.jit import inlined_kernel, kernel
 from .cone import rows_of, runs_of, strength
 from .cone_table import Cones, cone_of
-from .surface_normals import WEIGHT_UNIT, Square, SurfaceNormals, square_of, sum_across, touched, unit_of_sums
+from .surface_normals import (
+    WEIGHT_UNIT,
+    Square,
+    SurfaceNormals,
+    square_of,
+    sum_across,
+    unit_of_sums,
+    window_of_influence,
+)
 
 ZONES = 3
 """Number of zones of incidence; two that are a few degrees wider, or five, are about as good."""
@@ -236,7 +244,7 @@ def narrowed(
     normals : SurfaceNormals
         Of length one in the window; they are changed.
     counts, slots
-        Of all cells that are `touched` by the window.
+        Of all cells in the `window_of_influence` of the window.
     edges : float64, shape (ZONES,)
     grid : Grid
     window : first row, last one plus one, and columns likewise
@@ -261,16 +269,16 @@ def with_own_angles(
     Parameters
     ----------
     normals : SurfaceNormals
-        Of length one in all that is `touched` by the window; they are changed in the window.
+        Of length one in the `window_of_influence` of the window; they are changed in the window.
     cones : records of `CONE`, shape (N,)
-        All that reach into the `touched` window.
+        All that reach into that `window_of_influence`.
     weights : int32, shape (N,)
         Number of readings that each represents.
     grid : Grid
     window : first row, last one plus one, and columns likewise
     edges : float64, shape (ZONES,)
     """
-    around = touched(window, grid)
+    around = window_of_influence(window, grid)
     slots = slots_of(normals, around)
     counts = no_counts(slots)
     count(cones, weights, normals, slots, around, edges, (0, len(cones)), counts, NEVER)

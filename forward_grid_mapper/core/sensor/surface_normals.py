@@ -247,7 +247,7 @@ def renewed(normals: SurfaceNormals, sums: NDArray[np.int64], grid: Grid, window
     return new
 
 
-def touched(window: Window, grid: Grid) -> Window:
+def window_of_influence(window: Window, grid: Grid) -> Window:
     """Return the window of the cells whose squares of `NEIGHBOURHOOD` reach into `window`."""
     bottom, top, left, right = window
     n, _ = square_of(grid.resolution)

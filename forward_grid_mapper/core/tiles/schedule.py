@@ -21,7 +21,7 @@ class Schedule:
         self._boxes = dict(boxes)
         self.stale = set(self._boxes if stale is None else stale)
 
-    def of(self, colour: Sequence[int]) -> list[int]:
+    def stale_of(self, colour: Sequence[int]) -> list[int]:
         """Return the stale tiles of a colour."""
         return [number for number in colour if number in self.stale]
 

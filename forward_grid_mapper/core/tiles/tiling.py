@@ -126,9 +126,16 @@ class Tiling:
         place = np.array(self.tiles[number][:2])[:, None]
         return np.asarray(((first <= place) & (place <= last)).all(axis=0))
 
-    def meeting(self, part: Grid, window: bool = False) -> list[int]:
-        """Return the tiles whose cores, or windows, overlap a part of the grid."""
-        m = self._margin if window else 0
+    def with_cores_in(self, part: Grid) -> list[int]:
+        """Return the tiles whose cores overlap a part of the grid."""
+        return self._within(part, 0)
+
+    def with_windows_in(self, part: Grid) -> list[int]:
+        """Return the tiles whose windows overlap a part of the grid."""
+        return self._within(part, self._margin)
+
+    def _within(self, part: Grid, m: int) -> list[int]:
+        """Return the tiles whose cores are at most `m` cells away from a part of the grid."""
         rows = range((part.row - m) // self._edge, (part.row + part.height - 1 + m) // self._edge + 1)
         columns = range((part.column - m) // self._edge, (part.column + part.width - 1 + m) // self._edge + 1)
         places = ((row - self._corner[0], column - self._corner[1]) for row in rows for column in columns)

@@ -17,7 +17,7 @@ from forward_grid_mapper.core.learning.sensor_calibration import (
     LEFT,
     TIME,
     OffsetEstimate,
-    as_good,
+    hardly_distinguishable,
     offset_estimates,
 )
 from forward_grid_mapper.core.learning.trial_maps import BLOCKS, MountedReadings, TrialMap
@@ -97,13 +97,13 @@ def test_late_is_as_good_as_behind_at_constant_speed(explained) -> None:
     for each in found:
         # at 1 m/s; positions of the last readings of the part are not known after its end
         assert each.value == pytest.approx(-0.2, abs=0.02)
-    assert as_good(found[0], found[1])
+    assert hardly_distinguishable(found[0], found[1])
 
 
 def test_clearly_worse_quantity_is_no_rival() -> None:
     nothing = np.zeros(BLOCKS)
     best = OffsetEstimate(TIME, 0.2, 0.01, 500.0, 9.0, 4000, TrialMap(0.0, nothing + 12.5 + NOISE))
     other = OffsetEstimate(FORWARD, 0.2, 0.01, 300.0, 6.0, 4000, TrialMap(0.0, nothing + 7.5))
-    assert not as_good(best, other)
-    assert as_good(best, other._replace(gain=450.0))
-    assert as_good(best, other._replace(best=best.best))
+    assert not hardly_distinguishable(best, other)
+    assert hardly_distinguishable(best, other._replace(gain=450.0))
+    assert hardly_distinguishable(best, other._replace(best=best.best))

@@ -11,7 +11,7 @@ from forward_grid_mapper.core.common.grid import Grid
 from forward_grid_mapper.core.common.parameters import Parameters
 from forward_grid_mapper.core.common.readings import Readings
 from forward_grid_mapper.core.mapping import Mapper
-from forward_grid_mapper.core.maps.cell_evidence import NOTHING, CellEvidence, cell_evidence
+from forward_grid_mapper.core.maps.cell_evidence import ROUNDING, CellEvidence, cell_evidence
 from forward_grid_mapper.core.maps.map_set import MapSet
 from forward_grid_mapper.core.sensor.forward_model import expectations
 from samples import random_readings
@@ -48,7 +48,7 @@ def test_nats_of_each_reading_are_the_difference_of_two_maps(seed: int, exponent
         expected = exponent * (likelihoods(with_it) - likelihoods(without))
         actual = np.zeros(len(maps.readings))
         actual[found.readings] = found.nats
-        assert actual == pytest.approx(np.where(np.abs(expected) > NOTHING, expected, 0.0), abs=1e-8)
+        assert actual == pytest.approx(np.where(np.abs(expected) > ROUNDING, expected, 0.0), abs=1e-8)
         assert found.data == pytest.approx(expected.sum(), abs=1e-6)
         assert (np.diff(np.abs(found.nats)) <= 0).all()
         nothing = without.copy()

@@ -9,11 +9,11 @@ import pytest
 from forward_grid_mapper.core.common.parameters import Parameters
 from forward_grid_mapper.core.messages.message_types import RangeMessage
 from forward_grid_mapper.core.messages.rep117 import (
-    CHOSEN,
+    CHOSEN_BY_USER,
     LONGEST_NAME,
     NEAREST,
-    OF_POSES,
     REASONS,
+    REASONS_OUTSIDE_MESSAGE,
     Measurement,
     measure,
     rejection_warnings,
@@ -94,7 +94,7 @@ def test_nan_of_a_few_sensors_stands_for_no_echo() -> None:
 
 
 def test_reasons_of_poses_are_known_reasons() -> None:
-    assert OF_POSES | CHOSEN < set(REASONS)
+    assert REASONS_OUTSIDE_MESSAGE | CHOSEN_BY_USER < set(REASONS)
 
 
 def test_warning_names_eight_sensors_at_most() -> None:

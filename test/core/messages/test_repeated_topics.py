@@ -12,7 +12,7 @@ import pytest
 from forward_grid_mapper.core.messages import repeated_topics
 from forward_grid_mapper.core.messages.message_batch import batch_of
 from forward_grid_mapper.core.messages.message_types import RangeMessage
-from forward_grid_mapper.core.messages.repeated_topics import ENOUGH, RepeatedTopics
+from forward_grid_mapper.core.messages.repeated_topics import LEAST_PAIRS, RepeatedTopics
 
 Topics = dict[str, list[RangeMessage]]
 
@@ -79,7 +79,7 @@ def test_array_and_its_copy_are_named_once() -> None:
         of('sonar', measured(5).__getitem__),
         of('rear', RAW.__getitem__),
         of('sonar', RAW.__getitem__, later=1000),
-        of('sonar', RAW.__getitem__, count=ENOUGH),
+        of('sonar', RAW.__getitem__, count=LEAST_PAIRS),
         of('sonar', lambda k: math.inf),
     ],
     ids=['another sensor with its frame', 'another frame', 'other stamps', 'few echoes', 'no echoes'],
@@ -102,6 +102,6 @@ def test_messages_without_a_stamp_are_not_compared() -> None:
 
 @pytest.mark.parametrize('at_once', [False, True])
 def test_number_of_compared_messages_is_bounded(monkeypatch: pytest.MonkeyPatch, at_once: bool) -> None:
-    monkeypatch.setattr(repeated_topics, 'MOST', 2 * ENOUGH)
+    monkeypatch.setattr(repeated_topics, 'MOST_COMPARED', 2 * LEAST_PAIRS)
     copies = {'/one': of('sonar', RAW.__getitem__), '/other': of('sonar', RAW.__getitem__)}
     assert notes(copies, at_once) == []

@@ -84,7 +84,9 @@ def test_tile_has_all_readings_that_touch_its_window(seed: int, size: float) -> 
         for window in (False, True):
             part = (tile.core, tile.window)[window]
             near = [k for k, t in enumerate(tiling.tiles) if common_part((t.core, t.window)[window], part).size]
-            assert set(near) <= set(tiling.meeting(part, window)), 'a tile that lies there is missing'
+            assert set(near) <= set(tiling.with_windows_in(part) if window else tiling.with_cores_in(part)), (
+                'a tile that lies there is missing'
+            )
     for tile, indices in zip(tiling.tiles, found, strict=True):
         rows, columns = grid.window(tile.window)
         inside = {
