@@ -15,7 +15,7 @@ from .core.messages.message_types import NANOSECONDS, OdometryMessage, Pose2
 COARSEST = 1e-3
 """Smallest difference between neighbouring floats, seconds, from which a type is too coarse for stamps."""
 
-APART = (0.01, math.radians(1.0))
+POSE_TOLERANCE = (0.01, math.radians(1.0))
 """Smallest differences, metres and radians, between two different poses of one stamp."""
 
 LEAVE_OUT = 'leave them out'
@@ -85,7 +85,7 @@ def ambiguous_stamps(odometry: list[OdometryMessage]) -> list[str]:
             continue
         distance = math.hypot(after.pose.x - before.pose.x, after.pose.y - before.pose.y)
         angle = abs(math.remainder(after.pose.yaw - before.pose.yaw, math.tau))
-        if distance > APART[0] or angle > APART[1]:
+        if distance > POSE_TOLERANCE[0] or angle > POSE_TOLERANCE[1]:
             count, far, turned = count + 1, max(far, distance), max(turned, angle)
     if not count:
         return []

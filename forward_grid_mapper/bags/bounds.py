@@ -25,11 +25,11 @@ LARGEST_CHUNK = 128 << 20
 LARGEST_MESSAGE = 16 << 20
 """Largest decompressed size of a message in a bag with compressed messages; a Range has 60, an Odometry 720."""
 
-FREE = 256 << 20
+ALWAYS_ALLOWED = 256 << 20
 """Decompressed size that is allowed for a file of any size."""
 
-RATIO = 100
-"""Largest ratio of decompressed to compressed size beyond `FREE`. For ranges and odometry it is about 10."""
+LARGEST_RATIO = 100
+"""Largest ratio of decompressed to compressed size beyond `ALWAYS_ALLOWED`. For ranges and odometry it is about 10."""
 
 LARGEST_METADATA = 16 << 20
 """Largest metadata.yaml, bytes; that of a bag with ten thousand files has 3 MB."""
@@ -43,7 +43,7 @@ _DECOMPRESSORS: dict[str, Callable[[], Any]] = {
 
 def most_unpacked(size: int) -> int:
     """Return the largest decompressed size that is allowed for a file of `size` bytes."""
-    return FREE + RATIO * size
+    return ALWAYS_ALLOWED + LARGEST_RATIO * size
 
 
 def megabytes(size: int) -> str:

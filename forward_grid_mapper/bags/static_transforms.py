@@ -18,7 +18,7 @@ from ..core.messages.rep117 import proper_name
 Transform = NDArray[np.float64]  # homogeneous, shape (4, 4)
 
 
-SAME = 1e-6
+TRANSFORM_TOLERANCE = 1e-6
 """Largest difference between numbers of equal poses, metres, and sines of angles: some have single precision."""
 
 
@@ -183,7 +183,7 @@ class StaticTransforms:
 
 def _same(one: tuple[str, Transform], other: tuple[str, Transform]) -> bool:
     """Return whether two transforms of a frame, each with its parent, are equal."""
-    return one[0] == other[0] and np.allclose(one[1], other[1], atol=SAME)
+    return one[0] == other[0] and np.allclose(one[1], other[1], atol=TRANSFORM_TOLERANCE)
 
 
 def way_up(frame: str, parent_of: Callable[[str], str | None]) -> list[str]:

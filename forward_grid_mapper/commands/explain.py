@@ -27,8 +27,8 @@ from .options import add_json_option, print_json
 COMMAND = 'explain'
 ARCHIVE = 'maps.npz'
 STATES = {1: 'occupied', 0: 'free', -1: 'not observed'}
-SHOWN = 5
-COUNTS = ('-n', '--readings')
+MOST_SHOWN = 5
+COUNT_OPTIONS = ('-n', '--readings')
 
 LARGEST_COORDINATE = 1e9
 """Metres; no map is larger, and indices of cells remain integers."""
@@ -51,7 +51,7 @@ def parser() -> argparse.ArgumentParser:
     made.add_argument('x', type=float, help='in the map frame, metres')
     made.add_argument('y', type=float)
     made.add_argument(
-        '-n', '--readings', type=int, metavar='N', help=f'readings to list (default {SHOWN}; as JSON all of them)'
+        '-n', '--readings', type=int, metavar='N', help=f'readings to list (default {MOST_SHOWN}; as JSON all of them)'
     )
     add_json_option(made)
     return made
@@ -73,7 +73,7 @@ def explain(options: argparse.Namespace) -> int:
     if options.json:
         print_json(explanation_data(maps, readings, found, options.readings))
     else:
-        shown = SHOWN if options.readings is None else max(options.readings, 0)
+        shown = MOST_SHOWN if options.readings is None else max(options.readings, 0)
         print('\n'.join(explanation(maps, readings, found, shown)))
     return 0
 
@@ -123,7 +123,7 @@ def _on_map(maps: MapArchive, x: float, y: float) -> bool:
     return bool(0 <= row < maps.grid.height and 0 <= column < maps.grid.width)
 
 
-def explanation(maps: MapArchive, readings: Readings, found: CellEvidence, shown: int = SHOWN) -> Iterator[str]:
+def explanation(maps: MapArchive, readings: Readings, found: CellEvidence, shown: int = MOST_SHOWN) -> Iterator[str]:
     """Yield the lines of the explanation."""
     cell, state = (found.row, found.column), int(maps.ml[found.row, found.column])
     x, y = (values[k] for values, k in zip(maps.grid.centers(), reversed(cell), strict=True))
@@ -184,8 +184,8 @@ def _name(readings: Readings, i: int) -> str:
 def _sensors(readings: Readings, which: NDArray[np.int64]) -> str:
     """Return the sensors of readings, those with most readings first."""
     counts = Counter(_name(readings, int(i)) for i in which)
-    named = [name if n == 1 else f'{name} ({n})' for name, n in counts.most_common(SHOWN)]
-    more = f' and {len(counts) - SHOWN} more' if len(counts) > SHOWN else ''
+    named = [name if n == 1 else f'{name} ({n})' for name, n in counts.most_common(MOST_SHOWN)]
+    more = f' and {len(counts) - MOST_SHOWN} more' if len(counts) > MOST_SHOWN else ''
     return ', '.join(named) + more
 
 
@@ -229,7 +229,7 @@ def _decisive_evidence(maps: MapArchive, found: CellEvidence, state: int) -> str
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command; return its exit code."""
     given, made = sys.argv[1:] if arguments is None else arguments, parser()
-    words = [word for before, word in itertools.pairwise(('', *given)) if before not in COUNTS and _is_one(word)]
+    words = [word for before, word in itertools.pairwise(('', *given)) if before not in COUNT_OPTIONS and _is_one(word)]
     place = words[1:]
     if len(place) == 2 and (comma := next((word for word in place if ',' in word), '')):
         made.error(f'{comma} has a comma; write numbers with a point: {comma.replace(",", ".")}')

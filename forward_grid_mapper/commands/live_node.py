@@ -20,15 +20,15 @@ from ..files.parameter_text import dump_parameters
 from .domain import own_domain
 from .signals import ENDS_WITH_STDIN
 
-SILENCE = 180.0
+LONGEST_SILENCE = 180.0
 """Longest wait for the node to start or to answer while it does not compile, seconds."""
 
-COMPILATION = 3600.0
+LONGEST_COMPILATION = 3600.0
 """Longest wait for an answer if the node compiles, seconds; slow computers need many minutes."""
 
-MOST = f'at most {COMPILATION / 60:.0f} minutes'
+AT_MOST = f'at most {LONGEST_COMPILATION / 60:.0f} minutes'
 
-ORDERLY = 15.0
+KILL_AFTER = 15.0
 """Seconds before a child that does not end is killed; the node ends itself after 5."""
 
 
@@ -51,7 +51,7 @@ def end_child(process: subprocess.Popen[bytes]) -> None:
     """End a child in order, or else kill it; return after its end."""
     process.terminate()
     try:
-        process.wait(ORDERLY)
+        process.wait(KILL_AFTER)
     except subprocess.TimeoutExpired:
         process.kill()
         process.wait()
@@ -77,7 +77,7 @@ class Limit:
     def begin(self) -> None:
         """Begin to wait."""
         now = self._now()
-        self._end, self._last = now + SILENCE, now + COMPILATION
+        self._end, self._last = now + LONGEST_SILENCE, now + LONGEST_COMPILATION
 
     def hear(self, diagnostics: Any) -> None:
         """Receive a message on `/diagnostics`."""
@@ -87,7 +87,7 @@ class Limit:
                     # otherwise it is idle, or compilation has failed
                     self.compiling = pair.value if pair.value.endswith('to do') else ''
         if self.compiling:
-            self._end = min(self._now() + SILENCE, self._last)
+            self._end = min(self._now() + LONGEST_SILENCE, self._last)
 
     @property
     def passed(self) -> str:
@@ -95,9 +95,9 @@ class Limit:
         if self._now() < self._end:
             return ''
         if self._end < self._last or not self.compiling:
-            return f'the node has not answered for {SILENCE:.0f} s'
+            return f'the node has not answered for {LONGEST_SILENCE:.0f} s'
         return (
-            f'the node still compiles after {COMPILATION / 60:.0f} minutes; compile without it, with '
+            f'the node still compiles after {LONGEST_COMPILATION / 60:.0f} minutes; compile without it, with '
             'python3 -m forward_grid_mapper warm_up, and repeat the command'
         )
 
@@ -221,7 +221,7 @@ class LiveNode:
             if why := self._limit.passed:
                 raise MapperError(f'{what}: {why}; {self._last_words()}')
             left = self._limit.compiling
-            self._tell(f'{what}: waiting until the node has compiled its kernels ({left}), {MOST}' if left else what)
+            self._tell(f'{what}: waiting until the node has compiled its kernels ({left}), {AT_MOST}' if left else what)
             rclpy.spin_once(self._client, timeout_sec=0.1)
 
     def _last_words(self) -> str:

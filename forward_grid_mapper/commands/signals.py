@@ -21,7 +21,7 @@ GRACE = 5.0
 """Seconds after a first signal in which further ones are ignored, so that the clean-up is not interrupted: terminals
 and `ros2 launch` send Ctrl-C repeatedly."""
 
-AGAIN = 0.1
+SEND_AGAIN_AFTER = 0.1
 """Seconds before a signal is sent again if its `Interrupted` was lost."""
 
 ENDS_WITH_STDIN = 'FORWARD_GRID_MAPPER_ENDS_WITH_STDIN'
@@ -139,7 +139,7 @@ class Interruptible:
             return
         self._lost, self._first = lost.exc_value, -GRACE
         number = lost.exc_value.code - 128
-        self._again = threading.Timer(AGAIN, os.kill, (os.getpid(), number))
+        self._again = threading.Timer(SEND_AGAIN_AFTER, os.kill, (os.getpid(), number))
         self._again.daemon = True
         self._again.start()
 

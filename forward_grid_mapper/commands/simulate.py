@@ -44,7 +44,7 @@ WORLD_OPTIONS = {
 }
 """Options of single worlds, and their defaults."""
 
-MOST = 10_000_000
+LARGEST_OPTION = 10_000_000
 """The largest value of these options; more would need too much memory and time."""
 
 FORMATS = {'mcap': 'bag', 'sqlite3': 'bag', 'ros1': 'drive.bag'}
@@ -109,8 +109,8 @@ def fill_in(options: argparse.Namespace, known: Mapping[str, Mapping[str, int]])
                 raise ParameterError(f'--{name} is an option of the world {world}, and the world is {options.world}')
             if given is not None and given < 1:
                 raise ParameterError(f'--{name} must be a positive number')
-            if given is not None and given > MOST:
-                raise ParameterError(f'--{name} must be at most {MOST}')
+            if given is not None and given > LARGEST_OPTION:
+                raise ParameterError(f'--{name} must be at most {LARGEST_OPTION}')
             setattr(options, name, default if given is None else given)
     if options.seed < 0:
         raise ParameterError('--seed must be a positive number or 0')

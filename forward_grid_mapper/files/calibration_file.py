@@ -13,7 +13,7 @@ from ..core.common.parameter import LARGEST_NUMBER
 from ..core.trajectory.certainty import Estimate
 from .small_text import read_text
 
-NAMES = {
+FILE_KEYS = {
     'scale': 'travel_factor',
     'turn_scale': 'turn_factor',
     'bias': 'turn_per_metre_deg',
@@ -21,10 +21,10 @@ NAMES = {
 }
 """Keys of the file for the values of the core's calibration."""
 
-MOST = {'scale': 0.5, 'turn_scale': 0.5, 'bias': math.radians(30.0), 'heading': math.radians(45.0)}
+LARGEST_VALUES = {'scale': 0.5, 'turn_scale': 0.5, 'bias': math.radians(30.0), 'heading': math.radians(45.0)}
 """Largest values of a file, positive or negative: larger ones would mean that the file is for another robot."""
 
-HOW = {
+HOW_TO_APPLY = {
     'scale': 'factor for every measured distance, or for the radius of both wheels',
     'turn_scale': 'factor for every measured turn, or divisor of the wheel separation',
     'bias': 'degrees to add to the yaw for each metre driven forwards (to the left is positive); if the robot has two '
@@ -44,13 +44,13 @@ def calibration_text(estimates: Mapping[str, Estimate], drive: str) -> str:
         '# turn before you change a wheel. process_bag applies them to other drives of this robot with',
         '# --odometry-calibration.',
     ]
-    for name, key in NAMES.items():
+    for name, key in FILE_KEYS.items():
         lines.append('')
         if name not in estimates:
             lines.append(f'# {key}: not known; this drive does not determine it')
             continue
         value, sigma = _shown(name, *estimates[name])
-        lines += [f'# {HOW[name]}', f'{key}: {value:.4f}  # ± {sigma:.4f}']
+        lines += [f'# {HOW_TO_APPLY[name]}', f'{key}: {value:.4f}  # ± {sigma:.4f}']
     return '\n'.join(lines) + '\n'
 
 
@@ -71,7 +71,7 @@ def load_calibration(path: Path | str) -> dict[str, float]:
         raise ParameterError(f'{path} is not valid YAML: {error}') from error
     if not isinstance(document, dict) or not document:
         raise ParameterError(f'{path} contains no calibration, such as "travel_factor: 1.012"')
-    names = {key: name for name, key in NAMES.items()}
+    names = {key: name for name, key in FILE_KEYS.items()}
     found = {}
     for key, value in document.items():
         if key not in names:
@@ -81,7 +81,7 @@ def load_calibration(path: Path | str) -> dict[str, float]:
         if isinstance(value, bool) or not isinstance(value, (int, float)) or not abs(value) < LARGEST_NUMBER:
             raise ParameterError(f'{path}: {key} is {value!r}, not a finite number')
         figure = value - 1.0 if key.endswith('factor') else math.radians(value)
-        if abs(figure) > MOST[name]:
+        if abs(figure) > LARGEST_VALUES[name]:
             raise ParameterError(f'{path}: {key} is {value:g}, which is not possible for a calibration of wheels')
         found[name] = figure
     return found
@@ -89,7 +89,7 @@ def load_calibration(path: Path | str) -> dict[str, float]:
 
 def _shown(name: str, value: float, sigma: float) -> tuple[float, float]:
     """Return a value, and its σ, in the units of the file."""
-    if NAMES[name].endswith('factor'):
+    if FILE_KEYS[name].endswith('factor'):
         return 1.0 + value, sigma
     return math.degrees(value), math.degrees(sigma)
 

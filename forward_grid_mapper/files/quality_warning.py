@@ -18,18 +18,18 @@ from ..core.learning.range_warnings import STANDSTILL_STEP
 from ..core.maps.map_set import MapSet
 from ..core.messages.message_types import Pose2
 
-TOO_MANY = 0.5
+MANY_UNEXPLAINED = 0.5
 """Fraction of unexplained readings above which there is a warning."""
 
 NOT_CONVERGED = 'the search ended at max_iterations before it converged; raise max_iterations'
 
-ENOUGH = 20
+LEAST_READINGS = 20
 """Fewest readings for a judgement."""
 
-FEW = 0.05
+FEW_RANDOM = 0.05
 """Random part of the echoes up to which the halves of a drive are not compared, which takes a second."""
 
-APART = 0.035
+LEAST_CONTRADICTION = 0.035
 """Least contradiction of the halves of a drive, nats an echo, for a warning; up to 0.03 in sound drives."""
 
 
@@ -72,7 +72,7 @@ def _of_one(readings: Readings, extrinsics: Mapping[str, Pose2], parameters: Par
 
 def without_echoes(readings: Readings) -> Iterator[str]:
     """Yield a warning if no sensor measures echoes; if only some do not, their health shows it."""
-    if len(readings) >= ENOUGH and not readings.echo.any():
+    if len(readings) >= LEAST_READINGS and not readings.echo.any():
         yield (
             f'none of {len(readings)} readings has an echo: do the sensors work, is max_range that of their data '
             'sheet in metres, and does the driver publish ranges in metres? The maps show only free space'
@@ -82,7 +82,7 @@ def without_echoes(readings: Readings) -> Iterator[str]:
 def quality_warning(maps: MapSet) -> str:
     """Return the reason why the maps should not be trusted; '' if there is none."""
     count, unexplained = len(maps.readings), int(np.count_nonzero(maps.unexplained))
-    if count < ENOUGH or unexplained <= TOO_MANY * count:
+    if count < LEAST_READINGS or unexplained <= MANY_UNEXPLAINED * count:
         return ''
     cause = (
         'odometry has one pose for all of them: does its driver fill in the pose, and not only the velocity (twist)? '
@@ -109,22 +109,22 @@ def _from_one_place(readings: Readings) -> bool:
 def contradiction_of_halves(maps: MapSet) -> float | None:
     """Return by how much the halves of a drive contradict each other, nats an echo; None if nearly all echoes fit."""
     echoes = int(np.count_nonzero(maps.readings.echo))
-    if np.count_nonzero(maps.unexplained) <= FEW * echoes:
+    if np.count_nonzero(maps.unexplained) <= FEW_RANDOM * echoes:
         return None
     return contradiction(maps.readings, maps.parameters)
 
 
-def halves_warning(apart: float | None, remedy: str) -> str:
+def halves_warning(contradiction: float | None, remedy: str) -> str:
     """Return the warning about halves that contradict each other; '' if they do not.
 
     Parameters
     ----------
-    apart : float or None
+    contradiction : float or None
         As from `contradiction_of_halves`.
     remedy : str
         The option that refines the trajectory; '' if it was given and found none.
     """
-    if apart is None or apart < APART:
+    if contradiction is None or contradiction < LEAST_CONTRADICTION:
         return ''
     corrects = f'{remedy} corrects this' if remedy else 'no better trajectory was found'
     return (

@@ -50,7 +50,7 @@ def report_data(maps: MapSet, source: Mapping[str, Any]) -> dict[str, Any]:
     sensors = {name: {**row, 'health': dataclasses.asdict(health[name])} for name, row in _sensors(maps).items()}
     for name, row in (rest.pop('sensors', None) or {}).items():
         sensors[name] = {**sensors.get(name, {}), **row}
-    apart, halves = _halves(maps, source)
+    contradiction, halves = _halves(maps, source)
     statistics = dict(maps.statistics)
     data = {
         'version': __version__,
@@ -65,7 +65,7 @@ def report_data(maps: MapSet, source: Mapping[str, Any]) -> dict[str, Any]:
             'unexplained': int(np.count_nonzero(maps.unexplained)),
             'log_likelihood': maps.log_likelihood,
             'objective': maps.objective,
-            'contradiction': apart,
+            'contradiction': contradiction,
         },
         'seconds': statistics.pop('seconds', {}),
         'statistics': statistics,
@@ -88,9 +88,9 @@ def _halves(maps: MapSet, source: Mapping[str, Any]) -> tuple[float | None, str]
     trajectory = source.get('trajectory') or {}
     if source.get('drives') or trajectory.get('refined'):
         return None, ''
-    apart = contradiction_of_halves(maps)
+    contradiction = contradiction_of_halves(maps)
     option = '--refine-poses' if source.get('bag') else 'refine_poses'
-    return apart, halves_warning(apart, '' if trajectory else option)
+    return contradiction, halves_warning(contradiction, '' if trajectory else option)
 
 
 def write_report(folder: Path | str, data: dict[str, Any]) -> None:

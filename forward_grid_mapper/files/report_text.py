@@ -19,7 +19,7 @@ UNTESTED = (
 _LABEL = 14
 _WIDTH = 100
 _SHOWN = 6
-MANY = 0.2
+MUCH_RANDOM = 0.2
 """Random part of the echoes that is not reached with good poses."""
 
 
@@ -216,7 +216,7 @@ def _result(data: dict[str, Any]) -> Iterator[str]:
         rows = (data.get('sensors') or {}).values()
         silent = sum(row.get('no_echo') or 0 for row in rows)
         # readings without an echo are hardly ever random measurements, and some sensors have few echoes
-        many = unexplained > MANY * ((readings or math.inf) - silent) and not sought
+        many = unexplained > MUCH_RANDOM * ((readings or math.inf) - silent) and not sought
         option = '--refine-poses' if (data.get('input') or {}).get('bag') else 'refine_poses'
         causes = f'odometry that drifts ({option}), wrong poses of sensors, or people who walk by'
         hint = f': many, as with {causes}' if many else ''

@@ -6,7 +6,7 @@ from pathlib import Path
 
 from ..core.common.errors import MapperError
 
-MOST = 1_000_000
+MOST_BYTES = 1_000_000
 """Most bytes of a parameter file or the YAML of a map; ours have 12 000, and YAML takes a second for the bound."""
 
 
@@ -16,14 +16,14 @@ def read_text(path: Path, error: type[MapperError]) -> str:
     Raises
     ------
     error
-        Naming the file, if it is larger than `MOST`, or not UTF-8.
+        Naming the file, if it is larger than `MOST_BYTES`, or not UTF-8.
     OSError
         If it cannot be read.
     """
     with path.open('rb') as file:
-        content = file.read(MOST + 1)
-    if len(content) > MOST:
-        raise error(f'{path} has more than {MOST:,} bytes; it is not a file of this kind')
+        content = file.read(MOST_BYTES + 1)
+    if len(content) > MOST_BYTES:
+        raise error(f'{path} has more than {MOST_BYTES:,} bytes; it is not a file of this kind')
     try:
         return content.decode('utf-8')
     except UnicodeDecodeError as reason:

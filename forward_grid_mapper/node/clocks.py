@@ -18,25 +18,25 @@ from ..core.messages.sensor_records import has_room
 JUMP_SPAN = 10.0
 """Seconds for which a jump counts, and between two warnings in the log."""
 
-AGAIN = 3
+JUMPS_OF_A_FAULT = 3
 """Jumps within `JUMP_SPAN` that are a fault; fewer may be a bag that is played again."""
 
-RARELY = 60.0
+LOG_AGAIN_AFTER = 60.0
 """Seconds before a sensor whose fault has ended and begins again is logged again."""
 
 WINDOW = 5 * NANOSECONDS
 """Nanoseconds, by arrivals, for which a sensor must be behind or ahead before a warning."""
 
-FEWEST = 5
+LEAST_READINGS = 5
 """Fewest readings within `WINDOW`."""
 
-APART = NANOSECONDS
+LEAST_LAG = NANOSECONDS
 """Nanoseconds by which all readings within `WINDOW` must be behind, or all ahead."""
 
-REMEMBERED = 30 * NANOSECONDS
+DELAYS_VALID_FOR = 30 * NANOSECONDS
 """Nanoseconds after which the delays of messages are found anew, since a clock may have been set."""
 
-KEPT = 4000
+MOST_KEPT = 4000
 """Most odometry messages that are kept to compare readings with, and most readings that wait for odometry."""
 
 
@@ -46,7 +46,7 @@ class OdometryClock:
     def __init__(self, associator: PoseAssociator, warn: Callable[[str], object]) -> None:
         self._associator, self._warn = associator, warn
         self._seen = self._counts()
-        self._jumps: deque[float] = deque(maxlen=AGAIN)
+        self._jumps: deque[float] = deque(maxlen=JUMPS_OF_A_FAULT)
         self._next = 0.0
 
     def check(self) -> None:
@@ -84,7 +84,7 @@ class OdometryClock:
 
     def faults(self) -> list[str]:
         """Return the faults, in words."""
-        if len(self._jumps) < AGAIN or time.monotonic() - self._jumps[0] > JUMP_SPAN:
+        if len(self._jumps) < JUMPS_OF_A_FAULT or time.monotonic() - self._jumps[0] > JUMP_SPAN:
             return []
         return ['the stamps of odometry jump again and again: do two nodes publish odometry, or is a clock set?']
 
@@ -114,7 +114,7 @@ class Arrivals:
         if not sent or not has_room(self._delays, sender):
             return now
         begin, least, before = self._delays.get(sender, (now, now - sent, now - sent))
-        if not 0 <= now - begin < REMEMBERED:
+        if not 0 <= now - begin < DELAYS_VALID_FOR:
             begin, least, before = now, now - sent, least
         least = min(least, now - sent)
         self._delays[sender] = begin, least, before
@@ -158,7 +158,7 @@ class SensorClocks:
         self._logged: dict[tuple[str, str], float] = {}
         self._open: set[tuple[str, str]] = set()
         self._wrong: dict[str, _Wrong] = {}
-        self._odometry: deque[tuple[int, int]] = deque(maxlen=KEPT)
+        self._odometry: deque[tuple[int, int]] = deque(maxlen=MOST_KEPT)
         self._early: list[tuple[int, str, int]] = []
 
     def clear(self) -> None:
@@ -183,7 +183,7 @@ class SensorClocks:
             return
         if self._odometry:
             newest, before = self._odometry[-1]
-            if newest - arrived > APART or before - stamp > APART:
+            if newest - arrived > LEAST_LAG or before - stamp > LEAST_LAG:
                 # a clock was set back, or a bag begins again
                 self._begin_anew()
             else:
@@ -199,7 +199,7 @@ class SensorClocks:
             return
         if self._odometry and arrived <= self._odometry[-1][0]:
             self._compare(arrived, frame, stamp)
-        elif len(self._early) < KEPT:
+        elif len(self._early) < MOST_KEPT:
             # odometry that arrived earlier may still wait for the node
             heappush(self._early, (arrived, frame, stamp))
 
@@ -213,10 +213,10 @@ class SensorClocks:
             return
         window.last, window.count = newest, window.count + 1
         window.least, window.most = min(lag, window.least), max(lag, window.most)
-        if arrived - window.begin >= WINDOW and window.count >= FEWEST:
+        if arrived - window.begin >= WINDOW and window.count >= LEAST_READINGS:
             # the smallest lag if all are behind, the smallest lead if all are ahead
             common = max(window.least, 0) + min(window.most, 0)
-            if abs(common) > APART:
+            if abs(common) > LEAST_LAG:
                 wrong = self._wrong.setdefault(frame, _Wrong())
                 wrong.time += arrived - window.begin
                 wrong.lag = max(wrong.lag, common, key=abs)
@@ -238,7 +238,7 @@ class SensorClocks:
         found = {
             frame: window.lag
             for frame, window in self._windows.items()
-            if abs(window.lag) > APART and newest - window.last < 2 * WINDOW
+            if abs(window.lag) > LEAST_LAG and newest - window.last < 2 * WINDOW
         }
         behind = {frame: lag for frame, lag in found.items() if lag > 0}
         ahead = {frame: -lag for frame, lag in found.items() if lag < 0}
@@ -253,7 +253,7 @@ class SensorClocks:
             )
             keys = {(side, frame) for frame in lags}
             current |= keys
-            if any(now >= self._logged.get(key, -RARELY) + RARELY for key in keys - self._open):
+            if any(now >= self._logged.get(key, -LOG_AGAIN_AFTER) + LOG_AGAIN_AFTER for key in keys - self._open):
                 self._logged |= dict.fromkeys(keys, now)
                 self._open |= keys
                 self._warn(texts[-1])

@@ -23,17 +23,17 @@ RECENT = 10.0
 """Longest time, seconds, over which rejected readings are counted: if a sensor measures rarely, or many have been
 rejected, so that the status does not change with each reading."""
 
-ENOUGH = 10
+ENOUGH_READINGS = 10
 """Readings after which the last second alone is enough."""
 
-MANY, OFTEN, FEW = 0.2, 0.1, 0.05
+MANY_IN_A_SECOND, MANY_RECENTLY, FEW_RECENTLY = 0.2, 0.1, 0.05
 """Fraction of the readings whose rejection gives a warning, if that of the last `RECENT` seconds is above the second
 number as well; and that of these seconds which ends it. One second may have many by chance."""
 
-NEARLY = 0.9
+NEARLY_FULL = 0.9
 """Fraction of `max_readings` from which a warning says that readings will be removed."""
 
-SHOWN = 20
+MOST_SHOWN = 20
 """Most names of frames in a message."""
 
 STREAMS = ('odometry', 'stamp of odometry', 'range')
@@ -165,7 +165,7 @@ class Health:
             what = 'they wait for their poses' if received else 'none has been received'
             return DiagnosticStatus.OK, f'no reading has been accepted so far: {what}'
         bound = associator.parameters.max_readings
-        if bound and NEARLY * bound < len(associator.buffer) <= bound:
+        if bound and NEARLY_FULL * bound < len(associator.buffer) <= bound:
             return DiagnosticStatus.WARN, (
                 f'{len(associator.buffer)} readings, and max_readings is {bound}: beyond it, the oldest are removed '
                 'where readings are densest'
@@ -204,8 +204,8 @@ class _Recent:
     def update(self, received: int, rejected: Counter[str]) -> tuple[_Span, bool]:
         """Add the counts; return the span to report, and whether many readings are rejected.
 
-        The span is the last second, or enough seconds to have `ENOUGH` readings. After many rejections it is longer if
-        the last second has fewer.
+        The span is the last second, or enough seconds to have `ENOUGH_READINGS` readings. After many rejections it is
+        longer if the last second has fewer.
         """
         now, looks = time.monotonic(), self._counts
         if received < looks[-1][1]:
@@ -218,11 +218,11 @@ class _Recent:
         while len(looks) > 2 and now - looks[1][0] >= RECENT:
             looks.popleft()
         k = len(looks) - 2
-        while k and received - looks[k][1] < ENOUGH:
+        while k and received - looks[k][1] < ENOUGH_READINGS:
             k -= 1
         span, whole = self._since(k), self._since(0)
-        at_once = span.has(MANY) and whole.has(OFTEN)
-        self._many = at_once or (self._many and whole.has(FEW))
+        at_once = span.has(MANY_IN_A_SECOND) and whole.has(MANY_RECENTLY)
+        self._many = at_once or (self._many and whole.has(FEW_RECENTLY))
         return (span if at_once or not self._many else whole), self._many
 
     def _since(self, k: int) -> _Span:
@@ -252,9 +252,9 @@ def _main_reason(counts: Counter[str]) -> str:
 
 
 def listed(frames: Collection[str]) -> str:
-    """Return at most `SHOWN` names, in words."""
-    more = f' and {len(frames) - SHOWN} more' if len(frames) > SHOWN else ''
-    return ', '.join(sorted(frames)[:SHOWN]) + more
+    """Return at most `MOST_SHOWN` names, in words."""
+    more = f' and {len(frames) - MOST_SHOWN} more' if len(frames) > MOST_SHOWN else ''
+    return ', '.join(sorted(frames)[:MOST_SHOWN]) + more
 
 
 def array(statuses: list[DiagnosticStatus], stamp: Any) -> DiagnosticArray:

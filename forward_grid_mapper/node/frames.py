@@ -15,7 +15,7 @@ from ..core.messages.stamp_order import GOES_ON, JUMPED_BACK, StampOrder
 
 TF, TF_STATIC = '/tf', '/tf_static'
 
-PATIENCE = 0.2
+LOOK_UP_AGAIN_AFTER = 0.2
 """Seconds before a frame that TF did not know is looked up again, so that a missing frame costs little."""
 
 
@@ -23,7 +23,7 @@ QUEUE = 2000
 """Most messages of TF that may wait for the node in the middleware, as for readings; tf2's own listener has 100, and
 interpolates over those that were dropped."""
 
-KEPT = 30
+CACHE_SECONDS = 30
 """Seconds of transforms that are kept, by stamps; with tf2's 10 s, those of a bag that is played ten times as fast are
 gone after a pause of a second."""
 
@@ -36,14 +36,14 @@ LOOKUPS = 100
 TILTED = Later('bad_pose')
 """Result for a transform to the map frame that is not a pose on a floor."""
 
-STILL = 1e-3
+FIXED_TOLERANCE = 1e-3
 """Largest change, metres or radians, of the pose of a sensor that is fixed to the robot."""
 
 MOST_MISSING = 1000
 """Most frames that are remembered as missing, or with a pose, so that invented names do not fill the memory."""
 
 
-TRANSFORM_PATIENCE = 3.0
+NO_TRANSFORM_FOR = 3.0
 """Seconds without a transform to the map frame before a warning."""
 
 
@@ -73,7 +73,7 @@ class Transforms:
         from rclpy.duration import Duration
         from rclpy.qos import QoSProfile
 
-        buffer = tf2_ros.Buffer(Duration(seconds=KEPT))
+        buffer = tf2_ros.Buffer(Duration(seconds=CACHE_SECONDS))
         # so that the listener lives as long as the buffer
         buffer.listener = tf2_ros.TransformListener(buffer, node, spin_thread=False, qos=QoSProfile(depth=QUEUE))
         _listen_to_volatile(buffer, node)
@@ -115,7 +115,7 @@ class Transforms:
         except self._error as error:
             if 'xtrapolation' in type(error).__name__:
                 return LATE
-            self._missing[key] = time.monotonic() + PATIENCE
+            self._missing[key] = time.monotonic() + LOOK_UP_AGAIN_AFTER
             return LATER
         return found.transform
 
@@ -162,7 +162,7 @@ class TfExtrinsics:
             first = self._used.setdefault(frame, pose)
             # what looks back may have a yaw of -180 degrees at one time and of 180 at another
             turned = math.remainder(pose.yaw - first.yaw, math.tau)
-            if max(abs(pose.x - first.x), abs(pose.y - first.y), abs(turned)) > STILL:
+            if max(abs(pose.x - first.x), abs(pose.y - first.y), abs(turned)) > FIXED_TOLERANCE:
                 self._moved.add(frame)
         return pose
 
@@ -225,7 +225,7 @@ class MapFrame:
     def fault(self) -> str:
         """Return the fault that has kept arriving odometry out of the map frame for some seconds, or ''."""
         now = time.monotonic()
-        return '' if now - self._lacking < TRANSFORM_PATIENCE or now - self._newest > TRANSFORM_PATIENCE else self.lack
+        return '' if now - self._lacking < NO_TRANSFORM_FOR or now - self._newest > NO_TRANSFORM_FOR else self.lack
 
     def convert(self, message: OdometryMessage) -> list[OdometryMessage]:
         """Add an odometry message; return those whose pose in the map frame is known now, in order, at most `LOOKUPS`.

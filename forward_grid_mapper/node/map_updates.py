@@ -15,13 +15,13 @@ import numpy as np
 from nav_msgs.msg import OccupancyGrid
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 
-WHOLE = 10.0
+WHOLE_MAP_EVERY = 10.0
 """Seconds after which the whole map is sent again if it changed, since updates may arrive before their map."""
 
-UNKNOWN = '_NODE_NAME_UNKNOWN_'
+UNKNOWN_NODE_NAME = '_NODE_NAME_UNKNOWN_'
 """The middleware's name for a node that it has not discovered yet."""
 
-FEW = QoSProfile(depth=10, reliability=ReliabilityPolicy.RELIABLE)
+UPDATES_QOS = QoSProfile(depth=10, reliability=ReliabilityPolicy.RELIABLE)
 
 
 class Box(NamedTuple):
@@ -56,7 +56,7 @@ class MapUpdates:
     def __init__(self, node: Any, whole: Any, kind: Any) -> None:
         """`whole` is the publisher of the map, `kind` is `map_msgs.msg.OccupancyGridUpdate`."""
         self._node, self._whole, self._kind = node, whole, kind
-        self._out = node.create_publisher(kind, f'{whole.topic_name}_updates', FEW)
+        self._out = node.create_publisher(kind, f'{whole.topic_name}_updates', UPDATES_QOS)
         self._last: OccupancyGrid | None = None
         self._stale = False
         self._sent = 0.0
@@ -101,10 +101,11 @@ class MapUpdates:
         subscribers = listeners(self._node, self._whole.topic_name)
         of_updates = Counter(listeners(self._node, self._out.topic_name).values())
         alone = any(
-            count > of_updates[node] or node[1] == UNKNOWN for node, count in Counter(subscribers.values()).items()
+            count > of_updates[node] or node[1] == UNKNOWN_NODE_NAME
+            for node, count in Counter(subscribers.values()).items()
         )
         new = not self._whole_subscribers.issuperset(subscribers)
-        return alone or new or not subscribers or time.monotonic() > self._sent + WHOLE
+        return alone or new or not subscribers or time.monotonic() > self._sent + WHOLE_MAP_EVERY
 
     def _update(self, now: OccupancyGrid, box: Box) -> Any:
         cells = np.frombuffer(now.data, np.int8).reshape(now.info.height, now.info.width)

@@ -175,7 +175,7 @@ class Reporter:
         unheard = self._extrinsics.known.keys() - sent
         # logged once for any number of new frames
         named = f'; there are poses for {diagnostics.listed(unheard)}: is it one of these?' if unheard else ''
-        for frame in sorted(unknown - self._reported)[: diagnostics.SHOWN]:
+        for frame in sorted(unknown - self._reported)[: diagnostics.MOST_SHOWN]:
             if len(self._reported) >= MOST_FRAMES:
                 break
             self._reported.add(frame)

@@ -11,7 +11,7 @@ from ..core.learning.sensor_health import SensorHealth, health_warning
 from ..core.messages.rep117 import MOST_NO_ECHO
 from .diagnostics import listed, status
 
-PAUSES, ENOUGH, RARE = 5, 100, 1000
+LEAST_PAUSES, LEAST_READINGS, READINGS_A_PAUSE = 5, 100, 1000
 """Pauses of sensors, and readings, from which a driver that sends nothing without an echo is likely; and readings for
 each pause from which it is not."""
 
@@ -27,7 +27,11 @@ def unsent_warning(pauses: int, counts: Mapping[str, tuple[int, int]]) -> str:
         From `ReadingBuffer.counts`.
     """
     readings, silent = (sum(numbers[k] for numbers in counts.values()) for k in (0, 1))
-    if pauses < max(PAUSES, readings / RARE) or readings < ENOUGH or silent > MOST_NO_ECHO * readings:
+    if (
+        pauses < max(LEAST_PAUSES, readings / READINGS_A_PAUSE)
+        or readings < LEAST_READINGS
+        or silent > MOST_NO_ECHO * readings
+    ):
         return ''
     return (
         f'sensors stopped sending for half a second or more, and sent again, {pauses} times so far, and hardly any '

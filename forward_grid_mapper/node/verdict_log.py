@@ -7,17 +7,17 @@ import time
 from collections.abc import Sequence
 from typing import Any
 
-LOOKS = 2
+CHECKS_BEFORE_LOG = 2
 """Consecutive checks, a second apart, after which a fault is logged: at the start, some faults pass."""
 
-ENDED = 10
+CHECKS_UNTIL_END = 10
 """Consecutive checks without a fault after which it has ended: many faults come and go, and some take seconds to be
 found."""
 
-AGAIN = 60.0
+LOG_AGAIN_AFTER = 60.0
 """Seconds before a fault that returned is logged again."""
 
-MOST = 100
+MOST_FAULTS = 100
 """Most faults that are remembered."""
 
 # the time over which readings are judged depends on the rate of the sensor
@@ -41,18 +41,22 @@ class VerdictLog:
         kinds = {_NUMBER.sub('#', fault): fault for fault in faults}
         self._seen = {kind: self._seen.get(kind, 0) + 1 for kind in kinds}
         absent = {kind: 0 if kind in kinds else checks + 1 for kind, checks in self._open.items()}
-        self._open = {kind: checks for kind, checks in absent.items() if checks < ENDED}
+        self._open = {kind: checks for kind, checks in absent.items() if checks < CHECKS_UNTIL_END}
         for kind, fault in kinds.items():
             # a fault that returned too early is logged later, if it lasts
-            if kind in self._open or self._seen[kind] < LOOKS or now < self._logged.get(kind, -AGAIN) + AGAIN:
+            if (
+                kind in self._open
+                or self._seen[kind] < CHECKS_BEFORE_LOG
+                or now < self._logged.get(kind, -LOG_AGAIN_AFTER) + LOG_AGAIN_AFTER
+            ):
                 continue
-            if len(self._logged) >= MOST:
+            if len(self._logged) >= MOST_FAULTS:
                 self._logged.clear()
             self._logged[kind] = now
             self._open[kind] = 0
             self._bad = True
             self._log.warning(fault)
         self._well = self._well + 1 if well and not kinds else 0
-        if self._bad and self._well >= ENDED:
+        if self._bad and self._well >= CHECKS_UNTIL_END:
             self._bad = False
             self._log.info('readings are mapped without faults again')

@@ -19,7 +19,7 @@ NO_STATIC = (
 )
 """Remedy if no transform is known."""
 
-NAMED = 3
+MOST_NAMED = 3
 """Most frames that are named as examples."""
 
 MOST_OPTIONS = 8
@@ -158,10 +158,10 @@ class BagExtrinsics:
         # two different prefixes are those of two robots
         found = [f'{name}, not {frame}' for name, frame in pairs if '/' not in name or '/' not in frame]
         if found:
-            more = f', and {len(found) - NAMED} more' if len(found) > NAMED else ''
+            more = f', and {len(found) - MOST_NAMED} more' if len(found) > MOST_NAMED else ''
             return (
-                f' The transforms have {"; ".join(found[:NAMED])}{more}: set the same prefix in the drivers of ranges '
-                f'and odometry as in the publisher of the transforms.'
+                f' The transforms have {"; ".join(found[:MOST_NAMED])}{more}: set the same prefix in the drivers of '
+                f'ranges and odometry as in the publisher of the transforms.'
             )
         tops = sorted({self._transforms.top_of(frame) for frame in frames} & set(known))
         if tops and base_frame.lstrip('/') in unknown:

@@ -16,15 +16,15 @@ from ..core.common.words import counted
 from ..core.messages.message_types import Pose2
 from ..core.messages.thinning import mixed, name_hashes
 
-SHARED = 0.5
+SAME_DRIVE_SHARE = 0.5
 """Fraction of the echoes of a drive that another drive has as well, with the same sensor, stamp and range, from which
 both are the same recording. It is 0 for two drives at different times, and small for simulated ones, whose stamps begin
 at the same time."""
 
-METRES, RADIANS = 0.01, math.radians(1.0)
+POSITION_TOLERANCE, ANGLE_TOLERANCE = 0.01, math.radians(1.0)
 """Smallest differences of the poses of a sensor, or of its limits, that cause a warning."""
 
-NAMED = 6
+MOST_NAMED = 6
 """Most drives or sensors that a warning names."""
 
 T = TypeVar('T')
@@ -76,7 +76,7 @@ def check_frames(drives: Sequence[Described]) -> None:
 
 
 def shared_echoes(drives: Sequence[Readings]) -> list[Shared]:
-    """Return the pairs of drives of which one shares at least the fraction `SHARED` of its echoes with the other."""
+    """Return the pairs of drives of which one shares at least `SAME_DRIVE_SHARE` of its echoes with the other."""
     echoes = [echoes_of(readings) for readings in drives]
     count = [len(hashes) for hashes in echoes]
     every = np.concatenate(echoes) if echoes else np.zeros(0, np.uint64)
@@ -95,7 +95,7 @@ def shared_echoes(drives: Sequence[Readings]) -> list[Shared]:
     return [
         Shared(one, other, n, (count[one], count[other]))
         for (one, other), n in sorted(pairs.items())
-        if n >= max(SHARED * min(count[one], count[other]), 1)
+        if n >= max(SAME_DRIVE_SHARE * min(count[one], count[other]), 1)
     ]
 
 
@@ -139,7 +139,7 @@ def contradictions(drives: Sequence[Described]) -> list[str]:
 def _poses(drives: Sequence[Described]) -> Iterator[str]:
     def key(pose: Pose2) -> Hashable:
         turn = math.remainder(pose.yaw, 2 * math.pi)
-        return round(pose.x / METRES), round(pose.y / METRES), round(turn / RADIANS)
+        return round(pose.x / POSITION_TOLERANCE), round(pose.y / POSITION_TOLERANCE), round(turn / ANGLE_TOLERANCE)
 
     poses = [{frame.lstrip('/'): pose for frame, pose in drive.extrinsics.items()} for drive in drives]
     for names, frames, usual, value in _differing(drives, poses, key, _same_pose):
@@ -153,10 +153,10 @@ def _poses(drives: Sequence[Described]) -> Iterator[str]:
 
 def _limits(drives: Sequence[Described]) -> Iterator[str]:
     def key(value: tuple[float, float]) -> Hashable:
-        return round(value[0] / METRES), round(value[1] / RADIANS)
+        return round(value[0] / POSITION_TOLERANCE), round(value[1] / ANGLE_TOLERANCE)
 
     def same(one: tuple[float, float], other: tuple[float, float]) -> bool:
-        return abs(one[0] - other[0]) <= METRES and abs(one[1] - other[1]) <= RADIANS
+        return abs(one[0] - other[0]) <= POSITION_TOLERANCE and abs(one[1] - other[1]) <= ANGLE_TOLERANCE
 
     for names, frames, usual, value in _differing(drives, [drive.limits for drive in drives], key, same):
         yield (
@@ -202,7 +202,7 @@ def _differing(
 
 def _same_pose(one: Pose2, other: Pose2) -> bool:
     away = math.hypot(one.x - other.x, one.y - other.y)
-    return away <= METRES and abs(math.remainder(one.yaw - other.yaw, 2 * math.pi)) <= RADIANS
+    return away <= POSITION_TOLERANCE and abs(math.remainder(one.yaw - other.yaw, 2 * math.pi)) <= ANGLE_TOLERANCE
 
 
 def _at(pose: Pose2) -> str:
@@ -218,6 +218,6 @@ def _and_more(frames: Sequence[str]) -> str:
 
 
 def listed(names: Sequence[str]) -> str:
-    """Return a list of names in words, at most `NAMED` of them."""
-    more = f' and {len(names) - NAMED} more' if len(names) > NAMED else ''
-    return ', '.join(names[:NAMED]) + more
+    """Return a list of names in words, at most `MOST_NAMED` of them."""
+    more = f' and {len(names) - MOST_NAMED} more' if len(names) > MOST_NAMED else ''
+    return ', '.join(names[:MOST_NAMED]) + more

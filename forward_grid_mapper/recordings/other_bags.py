@@ -14,7 +14,7 @@ import numpy as np
 from ..bags.choice import Topics
 from ..bags.opening import storage_files
 from ..bags.reader import Bag
-from ..bags.static_transforms import SAME, StaticTransforms
+from ..bags.static_transforms import TRANSFORM_TOLERANCE, StaticTransforms
 from ..core.common.errors import BagError, InputError
 from ..core.messages.extrinsics import Mount
 from ..files.journal import drive_file
@@ -89,7 +89,11 @@ class OtherBags:
 
 def _same(one: Mount, other: Mount) -> bool:
     turned = np.exp(1j * one.yaw) - np.exp(1j * other.yaw)
-    return bool(np.allclose(one[:2], other[:2], atol=SAME) and abs(turned) < SAME and one.elevation == other.elevation)
+    return bool(
+        np.allclose(one[:2], other[:2], atol=TRANSFORM_TOLERANCE)
+        and abs(turned) < TRANSFORM_TOLERANCE
+        and one.elevation == other.elevation
+    )
 
 
 @lru_cache(maxsize=4096)

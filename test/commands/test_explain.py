@@ -64,7 +64,7 @@ def test_explanation_has_the_nats_of_all_readings(
     assert total and (float(total[1]), int(total[2])) == (pytest.approx(found.data, abs=0.051), len(found.readings))
     groups = re.findall(r'^ +([+-][\d.]+)  (\d+) readings? \w+', output, re.MULTILINE)
     assert sum(int(count) for _, count in groups) == len(found.readings)
-    assert len(re.findall(r' s  \S+$', output, re.MULTILINE)) == min(explain.SHOWN, len(found.readings))
+    assert len(re.findall(r' s  \S+$', output, re.MULTILINE)) == min(explain.MOST_SHOWN, len(found.readings))
 
 
 def test_explanation_mentions_a_wall_in_between(maps: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -10,7 +10,7 @@ from typing import Any
 
 import pytest
 
-from forward_grid_mapper.commands.live_node import COMPILATION, SILENCE, Limit, LiveNode
+from forward_grid_mapper.commands.live_node import LONGEST_COMPILATION, LONGEST_SILENCE, Limit, LiveNode
 from forward_grid_mapper.core.common.errors import MapperError
 from forward_grid_mapper.core.common.parameters import Parameters
 
@@ -50,8 +50,8 @@ def turned(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[[Callabl
 
 
 def test_compilation_on_a_slow_computer_is_waited_for_with_a_note(turned: Any) -> None:
-    made = turned(lambda now: diagnostics('2 to do' if now < 10 * SILENCE else 'idle'))
-    made.wait(10.5 * SILENCE)
+    made = turned(lambda now: diagnostics('2 to do' if now < 10 * LONGEST_SILENCE else 'idle'))
+    made.wait(10.5 * LONGEST_SILENCE)
     assert made.told[0] == made.told[-1] == 'running EM'
     assert 'running EM: waiting until the node has compiled its kernels (2 to do), at most 60 minutes' in made.told
 
@@ -59,10 +59,10 @@ def test_compilation_on_a_slow_computer_is_waited_for_with_a_note(turned: Any) -
 def test_compilation_is_not_waited_for_without_end(turned: Any) -> None:
     made = turned(lambda now: diagnostics('1 to do'))
     with pytest.raises(MapperError, match=r'running EM: the node still compiles after 60 minutes; .* warm_up'):
-        made.wait(10 * COMPILATION)
-    assert COMPILATION <= made.now <= COMPILATION + SECONDS
+        made.wait(10 * LONGEST_COMPILATION)
+    assert LONGEST_COMPILATION <= made.now <= LONGEST_COMPILATION + SECONDS
     # the next call has a time of its own
-    made.wait(COMPILATION / 2)
+    made.wait(LONGEST_COMPILATION / 2)
 
 
 @pytest.mark.parametrize(
@@ -76,17 +76,17 @@ def test_compilation_is_not_waited_for_without_end(turned: Any) -> None:
 )
 def test_node_that_does_not_answer_is_not_waited_for_long(turned: Any, comes: Callable[[float], Any]) -> None:
     made = turned(comes)
-    made.wait(SILENCE / 2)
+    made.wait(LONGEST_SILENCE / 2)
     with pytest.raises(MapperError, match='running EM: the node has not answered for 180 s; it printed nothing'):
-        made.wait(10 * SILENCE)
-    assert made.now <= 1.5 * SILENCE + 2 * SECONDS
+        made.wait(10 * LONGEST_SILENCE)
+    assert made.now <= 1.5 * LONGEST_SILENCE + 2 * SECONDS
 
 
 def test_node_that_hangs_while_it_compiles_is_not_waited_for_long(turned: Any) -> None:
-    made = turned(lambda now: diagnostics('1 to do') if now < 3 * SILENCE else None)
+    made = turned(lambda now: diagnostics('1 to do') if now < 3 * LONGEST_SILENCE else None)
     with pytest.raises(MapperError, match='has not answered for 180 s'):
-        made.wait(10 * SILENCE)
-    assert made.now <= 4 * SILENCE + SECONDS
+        made.wait(10 * LONGEST_SILENCE)
+    assert made.now <= 4 * LONGEST_SILENCE + SECONDS
 
 
 def test_node_that_ends_is_reported_at_once(turned: Any, tmp_path: Path) -> None:
@@ -94,5 +94,5 @@ def test_node_that_ends_is_reported_at_once(turned: Any, tmp_path: Path) -> None
     made.ended = 1
     (tmp_path / 'node.log').write_text('a\nb\nc\nmapper: error: no\n')
     with pytest.raises(MapperError, match=r'the node ended; its last words: b \| c \| mapper: error: no'):
-        made.wait(SILENCE)
+        made.wait(LONGEST_SILENCE)
     assert made.now == 0.0

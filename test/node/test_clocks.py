@@ -14,7 +14,7 @@ from stand_ins import Taking
 
 from forward_grid_mapper.core.messages.extrinsics import LATE
 from forward_grid_mapper.node import clocks
-from forward_grid_mapper.node.clocks import AGAIN, JUMP_SPAN, RARELY, Arrivals
+from forward_grid_mapper.node.clocks import JUMP_SPAN, JUMPS_OF_A_FAULT, LOG_AGAIN_AFTER, Arrivals
 from forward_grid_mapper.node.frames import MapFrame, Transforms
 
 
@@ -51,7 +51,7 @@ def test_two_odometry_sources_with_different_clocks_give_rare_warnings(clock: An
 
 def test_restarted_bag_is_no_fault(clock: Any) -> None:
     robot = taking()
-    for _ in range(AGAIN + 2):
+    for _ in range(JUMPS_OF_A_FAULT + 2):
         clock.now += 0.6 * JUMP_SPAN
         for k in range(10):
             robot.odometry(100.0 + k)
@@ -240,7 +240,7 @@ def test_fault_that_begins_again_is_logged_again(clock: Any) -> None:
     assert logged(20, 0.0) == 0
     # too soon, and then it is due
     assert logged(10, 3.0) == 0
-    assert logged(round(RARELY), 3.0) == 1
+    assert logged(round(LOG_AGAIN_AFTER), 3.0) == 1
     assert logged(20, 0.0) == 0
     # a fault of the other kind is new
     assert logged(20, -3.0) == 1

@@ -190,7 +190,7 @@ def test_odometry_with_constant_stamps_is_bounded(transforms: Transforms) -> Non
 def test_jump_back_of_time_deletes_transforms(
     buffer: Buffer, transforms: Transforms, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(frames, 'PATIENCE', 0.0)
+    monkeypatch.setattr(frames, 'LOOK_UP_AGAIN_AFTER', 0.0)
     frame = MapFrame('map', transforms, 2.0)
     buffer.known['map', 'odom'] = transform(1.0, 0.0)
 
@@ -209,7 +209,7 @@ def test_jump_back_of_time_deletes_transforms(
 def test_jump_back_of_time_renews_sensor_poses_in_the_odometry_frame(
     buffer: Buffer, transforms: Transforms, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(frames, 'PATIENCE', 0.0)
+    monkeypatch.setattr(frames, 'LOOK_UP_AGAIN_AFTER', 0.0)
     frame, extrinsics = MapFrame('', transforms, 2.0), TfExtrinsics({}, transforms)
     buffer.known['base', 'sonar'] = transform(0.1, 0.0)
     frame.convert(OdometryMessage(100 * NANOSECONDS, 'odom', 'base', Pose2(0.0, 0.0, 0.0)))
@@ -263,7 +263,7 @@ def test_late_transform_has_another_reason_than_an_unknown_frame(buffer: Buffer,
 def test_frame_with_a_transform_is_removed_from_unknown_frames(
     buffer: Buffer, transforms: Transforms, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(frames, 'PATIENCE', 0.0)
+    monkeypatch.setattr(frames, 'LOOK_UP_AGAIN_AFTER', 0.0)
     now = [0.0]
     associator = PoseAssociator(TfExtrinsics({}, transforms), clock=lambda: now[0])
     for stamp in range(10):
@@ -392,11 +392,11 @@ def test_missing_frame_is_looked_up_again_later(
         for name in ('sonar', 'another'):
             assert transforms.lookup('base', name, 5) is LATER
     assert buffer.lookups == 2
-    now += frames.PATIENCE
+    now += frames.LOOK_UP_AGAIN_AFTER
     assert transforms.lookup('base', 'sonar', 5) is LATER
     assert buffer.lookups == 3
     buffer.known['base', 'sonar'] = transform(0.1, 0.0)
-    now += frames.PATIENCE
+    now += frames.LOOK_UP_AGAIN_AFTER
     for _ in range(3):
         assert transforms.lookup('base', 'sonar', 5) is buffer.known['base', 'sonar']
 

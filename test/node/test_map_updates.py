@@ -21,7 +21,7 @@ from std_msgs.msg import Header
 from forward_grid_mapper.core.common.grid import Grid
 from forward_grid_mapper.node import map_updates
 from forward_grid_mapper.node.grid_message import grid_message
-from forward_grid_mapper.node.map_updates import WHOLE, Box, MapUpdates, changed_box
+from forward_grid_mapper.node.map_updates import WHOLE_MAP_EVERY, Box, MapUpdates, changed_box
 from forward_grid_mapper.node.mapper_node import MapperNode
 
 
@@ -161,7 +161,7 @@ def test_without_subscribers_the_whole_map_is_published(network: Network, update
 
 
 def test_subscriber_with_unknown_name_gets_whole_maps(network: Network, updates: MapUpdates) -> None:
-    network.join(map_updates.UNKNOWN, follows=True)
+    network.join(map_updates.UNKNOWN_NODE_NAME, follows=True)
     for k in range(3):
         updates.publish(message(np.full((2, 2), k % 2, np.int8)))
     assert all(isinstance(sent, OccupancyGrid) for sent in network.sent)
@@ -193,7 +193,11 @@ def test_whole_map_is_sent_at_intervals(network: Network, updates: MapUpdates, m
         updates.publish(message(np.full((2, 2), k % 2, np.int8)))
         kinds.append(isinstance(network.sent[-1], OccupancyGrid))
         now += 1.0
-    assert [k for k, whole in enumerate(kinds) if whole] == [0, int(WHOLE) + 1, 2 * (int(WHOLE) + 1)]
+    assert [k for k, whole in enumerate(kinds) if whole] == [
+        0,
+        int(WHOLE_MAP_EVERY) + 1,
+        2 * (int(WHOLE_MAP_EVERY) + 1),
+    ]
 
 
 @pytest.mark.parametrize('seed', range(40))

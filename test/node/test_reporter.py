@@ -20,7 +20,7 @@ from forward_grid_mapper.node.diagnostics import RECENT, Health
 from forward_grid_mapper.node.frames import MapFrame, TfExtrinsics, Transforms
 from forward_grid_mapper.node.reporter import Reporter
 from forward_grid_mapper.node.sensor_silence import SILENT_INTERVALS
-from forward_grid_mapper.node.verdict_log import ENDED, LOOKS, VerdictLog
+from forward_grid_mapper.node.verdict_log import CHECKS_BEFORE_LOG, CHECKS_UNTIL_END, VerdictLog
 
 OK, WARN = b'\x00', b'\x01'
 
@@ -335,17 +335,17 @@ def test_end_of_faults_is_logged_only_if_readings_are_mapped(inside: Any) -> Non
     for k in range(20):
         robot.odometry(100.0 + 0.1 * k)
         robot.range(100.0 + 0.1 * k, frame='')
-    looks(LOOKS)
+    looks(CHECKS_BEFORE_LOG)
     (fault,) = log.warned
     assert 'empty_frame_id' in fault
     robot.call(node.pause, SimpleNamespace(data=True))
-    looks(LOOKS)
+    looks(CHECKS_BEFORE_LOG)
     robot.call(node.pause, SimpleNamespace(data=False))
     robot.call(node.reset)
-    looks(LOOKS)
+    looks(CHECKS_BEFORE_LOG)
     assert log.warned == [fault]
     robot.drive(40, 20)
-    looks(ENDED - 1)
+    looks(CHECKS_UNTIL_END - 1)
     assert log.warned == [fault]
     looks(1)
     assert log.warned == [fault, 'readings are mapped without faults again']
@@ -360,7 +360,7 @@ def test_end_of_faults_is_not_logged_after_a_jump(inside: Any, kind: str) -> Non
     for k in range(20, 40):
         robot.odometry(100.0 + 0.05 * k, 0.02)
         robot.range(100.0 + 0.05 * k, frame='')
-    for _ in range(LOOKS):
+    for _ in range(CHECKS_BEFORE_LOG):
         robot.status('readings')
     assert len(log.warned) == 1
     if kind == 'of the clock':
@@ -373,7 +373,7 @@ def test_end_of_faults_is_not_logged_after_a_jump(inside: Any, kind: str) -> Non
             robot.range(100.0 + 0.05 * k)
         robot.until(lambda: robot.status('trajectory')['level'] == WARN, 20.0)
     assert len(log.warned) == 1
-    for _ in range(ENDED + 5):
+    for _ in range(CHECKS_UNTIL_END + 5):
         status = robot.status('readings')
     assert status['message'] == 'mapping'
     assert len(log.warned) == 1

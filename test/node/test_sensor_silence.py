@@ -15,7 +15,7 @@ from inside import Inside
 from forward_grid_mapper.core.messages.sensor_records import MOST_FRAMES
 from forward_grid_mapper.node import sensor_silence
 from forward_grid_mapper.node.sensor_silence import PAUSE, SILENT_INTERVALS, TIME_OUT, SensorSilence
-from forward_grid_mapper.node.sensor_status import PAUSES
+from forward_grid_mapper.node.sensor_status import LEAST_PAUSES
 
 OK, WARN = b'\x00', b'\x01'
 
@@ -217,7 +217,7 @@ def test_driver_that_sends_nothing_without_echo_is_named(
         robot.until(lambda: not robot.node.intake.busy)
         return robot.status('sensors')
 
-    for _ in range(PAUSES):
+    for _ in range(LEAST_PAUSES):
         drive(2.0, 'sonar', 'other')
         drive(2.0, 'sonar')
     status = drive(2.0, 'sonar', 'other')

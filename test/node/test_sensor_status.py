@@ -14,7 +14,13 @@ from diagnostic_msgs.msg import DiagnosticStatus
 from forward_grid_mapper.core.common.parameters import Parameters
 from forward_grid_mapper.core.learning.sensor_health import sensor_health
 from forward_grid_mapper.core.mapping import Mapper
-from forward_grid_mapper.node.sensor_status import ENOUGH, PAUSES, RARE, SensorWatch, unsent_warning
+from forward_grid_mapper.node.sensor_status import (
+    LEAST_PAUSES,
+    LEAST_READINGS,
+    READINGS_A_PAUSE,
+    SensorWatch,
+    unsent_warning,
+)
 from forward_grid_mapper.simulation.drive import drive
 from forward_grid_mapper.simulation.sonar import NOISY
 from forward_grid_mapper.simulation.world import rooms_world
@@ -48,11 +54,13 @@ def test_dead_sensor_is_named_after_em() -> None:
 
 
 def test_driver_that_sends_nothing_without_echo_is_named_only_if_likely() -> None:
-    assert f'and sent again, {PAUSES} times' in unsent_warning(PAUSES, {'left': (900, 0), 'right': (900, 9)})
-    assert unsent_warning(PAUSES - 1, {'sonar': (1000, 0)}) == ''
-    assert unsent_warning(PAUSES, {'sonar': (ENOUGH - 1, 0)}) == ''
+    assert f'and sent again, {LEAST_PAUSES} times' in unsent_warning(
+        LEAST_PAUSES, {'left': (900, 0), 'right': (900, 9)}
+    )
+    assert unsent_warning(LEAST_PAUSES - 1, {'sonar': (1000, 0)}) == ''
+    assert unsent_warning(LEAST_PAUSES, {'sonar': (LEAST_READINGS - 1, 0)}) == ''
     # readings without an echo arrive
-    assert unsent_warning(PAUSES, {'left': (900, 0), 'right': (900, 20)}) == ''
+    assert unsent_warning(LEAST_PAUSES, {'left': (900, 0), 'right': (900, 20)}) == ''
     # a pause in an hour may have any cause
-    assert unsent_warning(2 * PAUSES, {'sonar': (2 * PAUSES * RARE + 1, 0)}) == ''
-    assert 'no echo' in unsent_warning(2 * PAUSES, {'sonar': (2 * PAUSES * RARE, 0)})
+    assert unsent_warning(2 * LEAST_PAUSES, {'sonar': (2 * LEAST_PAUSES * READINGS_A_PAUSE + 1, 0)}) == ''
+    assert 'no echo' in unsent_warning(2 * LEAST_PAUSES, {'sonar': (2 * LEAST_PAUSES * READINGS_A_PAUSE, 0)})

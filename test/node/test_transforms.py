@@ -89,8 +89,8 @@ def tf2(monkeypatch: pytest.MonkeyPatch) -> None:
     for name, module in modules.items():
         monkeypatch.setitem(sys.modules, name, module)
     monkeypatch.setattr(graph_check, 'GRAPH_PERIOD', 0.05)
-    monkeypatch.setattr(frames, 'TRANSFORM_PATIENCE', 0.2)
-    monkeypatch.setattr(frames, 'PATIENCE', 0.0)
+    monkeypatch.setattr(frames, 'NO_TRANSFORM_FOR', 0.2)
+    monkeypatch.setattr(frames, 'LOOK_UP_AGAIN_AFTER', 0.0)
 
 
 @pytest.fixture
@@ -158,7 +158,7 @@ def test_transforms_wait_for_the_node_as_long_as_readings_do(inside: Callable[..
     robot = inside()
     robot.node.start()
     buffer: Any = robot.node._extrinsics._transforms._buffer
-    assert buffer.cache_time.nanoseconds == frames.KEPT * 10**9
+    assert buffer.cache_time.nanoseconds == frames.CACHE_SECONDS * 10**9
     of_tf = buffer.listener.tf_sub.qos_profile
     assert (of_tf.depth, of_tf.durability) == (intake.QUEUE, DurabilityPolicy.VOLATILE)
     assert of_tf.reliability == ReliabilityPolicy.RELIABLE
