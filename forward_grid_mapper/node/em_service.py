@@ -130,7 +130,7 @@ class EmService:
                 reply.send(True, '; '.join(filter(None, [*said, outcome.trajectory, *warned])))
 
         run = self.current
-        if (run is None or run.by_itself) and not all(map(self._kernels.has, self._needed())):
+        if (run is None or run.by_itself) and not all(map(self._kernels.has, self._kernel_steps())):
             self._logger.info('run_em waits for the compilation of kernels, as at the first start')
         if run is None:
             self._start(done)
@@ -227,13 +227,13 @@ class EmService:
     def _start(self, *callers: Callable[[Outcome], object]) -> Run:
         """Begin a run, and have callers called with its outcome."""
         generation, parameters = self._publishers.generation, self._parameters()
-        compiled = all(map(self._kernels.has, self._needed()))
+        compiled = all(map(self._kernels.has, self._kernel_steps()))
         data = RunInput(self._associator, self._inbox, self.mounts(), compiled, lambda: run.cancelled)
 
         def on_maps(maps: MapSet) -> None:
             if isinstance(mapper, RefiningMapper) or in_map_frame:
                 # the transform from the map frame changes together with the maps
-                self._inbox.put(lambda: self._show_moved(run, maps, data.accepted, generation))
+                self._inbox.put(lambda: self._adopt_and_show(run, maps, data.accepted, generation))
             else:
                 self._show(maps, generation)
 
@@ -273,7 +273,7 @@ class EmService:
         self._publishers.publish('ml_map', generation, maps.grid, maps.ml)
         self._publishers.publish('uncertainty_map', generation, maps.grid, maps.uncertainty)
 
-    def _show_moved(self, run: Run, maps: MapSet, count: int, generation: int) -> None:
+    def _adopt_and_show(self, run: Run, maps: MapSet, count: int, generation: int) -> None:
         """Use the trajectory of a run, and publish its maps."""
         if generation == self._publishers.generation:
             run.trajectory_adopted = True
@@ -281,12 +281,12 @@ class EmService:
             self._trajectory.adopt(found, count)
             self._show(maps, generation)
 
-    def _needed(self) -> tuple[str, ...]:
+    def _kernel_steps(self) -> tuple[str, ...]:
         """Return the steps of compilation that a run needs."""
         return ('EM', 'trajectory') if self._parameters().node.refine_poses else ('EM',)
 
     def _wait_for_kernels(self, stop: Callable[[], bool]) -> None:
-        for step in self._needed():
+        for step in self._kernel_steps():
             self._kernels.wait(step, stop)
 
     def _why_no_maps(self, run: Run, data: RunInput) -> str:
