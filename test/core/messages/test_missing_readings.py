@@ -114,10 +114,13 @@ def test_batch_counts_as_single_messages(seed: int, sizes: list[int]) -> None:
         for message in messages:
             one.add(message)
         many.add_all(batch_of(list(enumerate(messages))).ranges)
-    assert (one._count, one._silent, one._of.keys()) == (many._count, many._silent, many._of.keys())
+    assert (one._count, one._silent, one._by_frame.keys()) == (many._count, many._silent, many._by_frame.keys())
     assert one._largest_max_range == many._largest_max_range
-    assert not one._of.keys() & {'', 'c\n'}
-    for first, second in [(one._together, many._together), *((one._of[name], many._of[name]) for name in one._of)]:
+    assert not one._by_frame.keys() & {'', 'c\n'}
+    for first, second in [
+        (one._together, many._together),
+        *((one._by_frame[name], many._by_frame[name]) for name in one._by_frame),
+    ]:
         assert first._last == second._last
         np.testing.assert_array_equal(first.counts, second.counts)
 
