@@ -138,7 +138,8 @@ class LimitWatch:
 def _usable(values: Floats) -> NDArray[np.bool_]:
     """Return which messages have a range and a limit, shape (N,)."""
     ranges, _, limits = values.T
-    return np.isfinite(ranges) & (ranges > 0) & (limits > 0) & (limits < np.inf)
+    usable: NDArray[np.bool_] = np.isfinite(ranges) & (ranges > 0) & (limits > 0) & (limits < np.inf)
+    return usable
 
 
 def _suspicion(values: Floats, sensor: NDArray[np.int64] | None = None) -> str:
