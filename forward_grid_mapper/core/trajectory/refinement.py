@@ -149,7 +149,7 @@ class Refiner:
         trajectory = refined(odometry, windows, nodes)
         moved, turned = differences(odometry, trajectory)
         if moved < least_moved:
-            return _without_better(by_walls.refinement)
+            return _without_better(by_walls.refinement, near_words(moved))
         better = gain_at_revisits(scans, windows.node, nodes, self._start_stage('judgement'))
         if better.sigmas < LEAST_SIGMAS:
             return _without_better(by_walls.refinement)
@@ -219,6 +219,14 @@ def too_sparse_words(apart: float) -> str:
     return (
         f'; poses of odometry are usually {apart:.1f} m apart, and scan matching needs one every {SCAN_MATCHED:g} m: '
         f'record odometry at a higher rate'
+    )
+
+
+def near_words(moved: float) -> str:
+    """Return why a trajectory from matching alone is not used that moves odometry by so little, metres."""
+    return (
+        f'; scan matching alone moves odometry by {moved:.2f} m (root mean square), which is not more than the '
+        'accuracy of sonar'
     )
 
 

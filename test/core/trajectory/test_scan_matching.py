@@ -161,6 +161,22 @@ def test_matching_alone_is_not_tried_with_sparse_poses(bent, matched, monkeypatc
     assert left.reason == right_angles.NO_WALLS + refinement.too_sparse_words(refinement.usual_step(sparse))
 
 
+def test_matching_alone_that_hardly_moves_odometry_is_not_called_no_better(bent, monkeypatch) -> None:
+    recording, odometry = bent
+    monkeypatch.setattr(right_angles, 'heading_of_walls', no_walls)
+
+    def hardly_moved(odometry: Odometry, scans: Scans, *rest: object) -> MatchedDrive:
+        nodes = scans.windows.node.copy()
+        nodes[::2, 0] += 0.1
+        return MatchedDrive(nodes, [], np.inf, 1.0)
+
+    monkeypatch.setattr(refinement, 'match_drive', hardly_moved)
+    left = Refiner(Parameters()).run(recording.readings, odometry)
+    assert not left.accepted
+    assert left.reason.startswith(right_angles.NO_WALLS + '; scan matching alone moves odometry by 0.0')
+    assert left.reason.endswith('which is not more than the accuracy of sonar')
+
+
 def test_usual_step_is_weighted_by_distance() -> None:
     # a hundred small steps of a robot that hardly moves, and most of the way in steps of half a metre
     along = np.concatenate([np.arange(101) * 0.01, 1.0 + np.arange(1, 11) * 0.5])
