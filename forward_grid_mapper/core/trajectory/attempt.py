@@ -2,19 +2,21 @@
 
 from __future__ import annotations
 
+import math
 from typing import NamedTuple
 
 import numpy as np
 
 from ..common.readings import Floats, Readings
 from .holding_out import Gain
-from .outcome import Refinement
+from .outcome import Differences, Refinement
 from .poses import compose, inverse
 from .scans import Scans
 from .windows import Odometry, Windows, corrected
 
-LEAST_MOVED = 0.15
-"""Least difference from odometry of an accepted trajectory, metres (rms): about the error of the trajectory itself."""
+ACCURACY, EXACT = Differences(0.15, math.radians(2.0)), Differences(0.0, 0.0)
+"""A trajectory is accepted only if it differs from odometry by more than the first: its own errors are about as large.
+Over 4 m, a turn of 2° moves walls by as much."""
 
 
 class Drive(NamedTuple):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 
@@ -136,7 +137,18 @@ def replaced(readings: Readings, odometry: Odometry, trajectory: Odometry) -> Re
     return at_poses(readings, compose(trajectory.at(readings.stamp), mount))
 
 
-def differences(odometry: Odometry, trajectory: Odometry) -> tuple[float, float]:
-    """Return the rms differences of positions, metres, and yaws, radians, of two trajectories after rigid alignment."""
+class Differences(NamedTuple):
+    """Rms differences of positions, metres, and yaws, radians, of two trajectories after rigid alignment."""
+
+    moved: float
+    turned: float
+
+    def within(self, largest: Differences) -> bool:
+        """Whether both differences are smaller than these."""
+        return self.moved < largest.moved and self.turned < largest.turned
+
+
+def differences(odometry: Odometry, trajectory: Odometry) -> Differences:
+    """Return the differences of two trajectories."""
     turned = float(np.std(trajectory.pose[:, 2] - odometry.pose[:, 2]))
-    return rms_after_alignment(odometry.pose, trajectory.pose), turned
+    return Differences(rms_after_alignment(odometry.pose, trajectory.pose), turned)

@@ -25,14 +25,14 @@ from ..common.readings import Floats, Readings
 from ..runtime.cancelling import check
 from .after_jumps import Part, begins_of, parts_at, with_doubtful
 from .any_angle import match_drive
-from .attempt import LEAST_MOVED, Attempt, Drive, gain_words, refined
+from .attempt import ACCURACY, EXACT, Attempt, Drive, gain_words, refined
 from .certainty import LARGEST_SIGMA, yaw_errors
 from .holding_out import LEAST_SIGMAS, Gain, has_revisits, held_out
 from .judging import gain_at_revisits, gain_of_objective
 from .jumps import MOST_JUMPS, jumps, without_outliers
 from .local_map import for_matching
 from .odometry_model import CALIBRATION
-from .outcome import Refinement, differences, joined_parts, replaced, with_all_poses, with_outliers
+from .outcome import Differences, Refinement, differences, joined_parts, replaced, with_all_poses, with_outliers
 from .passes import BLOCK
 from .refinable import unfit, without_times
 from .relocating import LEAST_RECOGNISED
@@ -105,15 +105,15 @@ class Refiner:
         for k, (own, part) in enumerate(cuts, 1):
             self._watch = partial(_report_part, watch, f'part {k} of {len(cuts)}, ')
             # the placement needs the best heading, so refined parts are accepted however little they move
-            outcomes.append(self._whole(own, part, 0.0))
+            outcomes.append(self._whole(own, part, EXACT))
         self._watch = watch
         self._start_stage('what follows jumps of odometry')
         parts = [Part(o.readings, part, o.trajectory, o.lost) for (_, part), o in zip(cuts, outcomes, strict=True)]
         begins = begins_of(parts, self._parameters, self._stop)
         return joined_parts(readings, odometry, parts, outcomes, begins)
 
-    def _whole(self, readings: Readings, odometry: Odometry, least_moved: float = LEAST_MOVED) -> Refinement:
-        """Return the trajectory of a drive without jumps; it must differ from odometry by `least_moved` metres."""
+    def _whole(self, readings: Readings, odometry: Odometry, least: Differences = ACCURACY) -> Refinement:
+        """Return the trajectory of a drive without jumps; it must differ from odometry by more than `least`."""
         reason = unfit(readings, odometry)
         if reason:
             return Refinement(False, reason, readings, odometry, {})
@@ -121,15 +121,15 @@ class Refiner:
         scans = Scans(windows, self._parameters, self._stop, held_out(len(windows)))
         drive = Drive(readings, odometry, windows, scans)
         noise = self._parameters.association.odometry_noise
-        by_walls = at_right_angles(drive, noise, least_moved, self._start_stage)
+        by_walls = at_right_angles(drive, noise, least, self._start_stage)
         if by_walls.sure:
             return by_walls.refinement
-        found = self._at_any_angle(drive, by_walls, least_moved)
+        found = self._at_any_angle(drive, by_walls, least)
         if found is by_walls.refinement and by_walls.by_votes:
             return _unless_unsupported(drive, by_walls)
         return found
 
-    def _at_any_angle(self, drive: Drive, by_walls: Attempt, least_moved: float) -> Refinement:
+    def _at_any_angle(self, drive: Drive, by_walls: Attempt, least: Differences) -> Refinement:
         """Return the trajectory by matching alone, if it is better than that by walls at right angles."""
         readings, odometry, windows, scans = drive
         known = by_walls.nodes if by_walls.refinement.accepted else None
@@ -147,13 +147,13 @@ class Refiner:
         if known is not None and gain_of_objective(scans, known, nodes).sigmas < LEAST_SIGMAS:
             return by_walls.refinement
         trajectory = refined(odometry, windows, nodes)
-        moved, turned = differences(odometry, trajectory)
-        if moved < least_moved:
-            return _without_better(by_walls.refinement, near_words(moved))
+        off = differences(odometry, trajectory)
+        if off.within(least):
+            return _without_better(by_walls.refinement, near_words(off.moved))
         better = gain_at_revisits(scans, windows.node, nodes, self._start_stage('judgement'))
         if better.sigmas < LEAST_SIGMAS:
             return _without_better(by_walls.refinement)
-        if known is None and (walls := self._by_walls_after_all(drive, by_walls, nodes, least_moved)) is not None:
+        if known is None and (walls := self._by_walls_after_all(drive, by_walls, nodes, least)) is not None:
             return walls
         at_revisits = 'where the robot came back, ' if has_revisits(scans, nodes) else ''
         by_name = dict.fromkeys(CALIBRATION, 0.0) | {
@@ -168,15 +168,14 @@ class Refiner:
             replaced(readings, odometry, trajectory),
             trajectory,
             by_name,
-            moved,
-            turned,
+            *off,
             len(found.loops),
             better.mean,
             right_angles=False,
         )
 
     def _by_walls_after_all(
-        self, drive: Drive, refused: Attempt, nodes: Floats, least_moved: float
+        self, drive: Drive, refused: Attempt, nodes: Floats, least: Differences
     ) -> Refinement | None:
         """Return the trajectory with walls at right angles, unless matching alone is better; then None.
 
@@ -186,7 +185,7 @@ class Refiner:
         by_walls = refused.unproven
         if refused.before_matching:
             noise = self._parameters.association.odometry_noise
-            by_walls = at_right_angles(drive, noise, least_moved, self._start_stage, odometry_is_wrong=True)
+            by_walls = at_right_angles(drive, noise, least, self._start_stage, odometry_is_wrong=True)
         if by_walls is None or not by_walls.refinement.accepted:
             return None
         for compared in (gain_at_revisits, gain_of_objective):

@@ -10,14 +10,14 @@ from typing import NamedTuple
 import numpy as np
 
 from ..common.readings import Floats
-from .attempt import LEAST_MOVED, Attempt, Drive, gain_words, refined
+from .attempt import ACCURACY, Attempt, Drive, gain_words, refined
 from .heading import NOISES, Heading, heading
 from .holding_out import LEAST_SIGMAS, Gain, has_revisits
 from .hypotheses import Solved, solve_hypotheses
 from .judging import gain_at_revisits, gain_over_drive, last_not_worse, turns_supported
 from .loops import Loop
 from .odometry_model import CALIBRATION
-from .outcome import Refinement, differences, replaced
+from .outcome import Differences, Refinement, differences, replaced
 from .passes import Progress
 from .pose_graph import Solution
 from .relocating import LEAST_RECOGNISED, recognised_part
@@ -109,7 +109,7 @@ class _Candidate(NamedTuple):
 def at_right_angles(
     drive: Drive,
     odometry_noise: float,
-    least_moved: float,
+    least: Differences,
     start_stage: Callable[[str], Progress],
     odometry_is_wrong: bool = False,
 ) -> Attempt:
@@ -120,8 +120,8 @@ def at_right_angles(
     drive : Drive
     odometry_noise : float
         The parameter of this name; 0 to estimate it.
-    least_moved : float
-        Least difference from odometry of an accepted trajectory, metres.
+    least : Differences
+        An accepted trajectory differs from odometry by more.
     start_stage : callable
         Receives the name of a stage, and returns the callable that receives its progress.
     odometry_is_wrong : bool
@@ -146,7 +146,7 @@ def at_right_angles(
     watch = start_stage('judgement')
     best = _best_of(drive, walls, found)
     verdict = walls.verdict if walls.proven else _at_revisits(drive, walls, best.nodes, watch)
-    attempt = _accepted(drive, best, verdict, walls.heading.drifts.noise, least_moved)
+    attempt = _accepted(drive, best, verdict, walls.heading.drifts.noise, least)
     if verdict.accepted or odometry_is_wrong:
         return attempt
     unproven = attempt if attempt.refinement.accepted else None
@@ -219,7 +219,7 @@ def _unproven(drive: Drive, walls: _AlongWalls, verdict: _Verdict) -> Attempt:
     """Return odometry, since nothing shows that it is wrong."""
     along = refined(drive.odometry, drive.windows, walls.along.nodes)
     # if walls agree with odometry, other methods need not be tried
-    agrees = differences(drive.odometry, along)[0] < LEAST_MOVED
+    agrees = differences(drive.odometry, along).within(ACCURACY)
     return _kept(drive, verdict.words + NOT_ENOUGH, walls.calibration, verdict.gain.mean, agrees)
 
 
@@ -242,13 +242,13 @@ def _at_revisits(drive: Drive, walls: _AlongWalls, nodes: Floats, watch: Progres
     return _Verdict(True, better, f'with walls at right angles, {likelier}; {words}', by_votes=True)
 
 
-def _accepted(drive: Drive, best: _Candidate, verdict: _Verdict, noise: float, least_moved: float) -> Attempt:
+def _accepted(drive: Drive, best: _Candidate, verdict: _Verdict, noise: float, least: Differences) -> Attempt:
     """Return the trajectory of nodes that are better than odometry; odometry if that is hardly off."""
     readings, odometry, windows, scans = drive
     trajectory = refined(odometry, windows, best.nodes)
-    moved, turned = differences(odometry, trajectory)
-    if moved < least_moved:
-        reason = f'odometry is off by {moved:.2f} m, which is not more than the accuracy of sonar'
+    off = differences(odometry, trajectory)
+    if off.within(least):
+        reason = f'odometry is off by {off.moved:.2f} m, which is not more than the accuracy of sonar'
         return _kept(drive, reason, best.calibration, verdict.gain.mean, sure=True)
     outcome = Refinement(
         True,
@@ -256,8 +256,7 @@ def _accepted(drive: Drive, best: _Candidate, verdict: _Verdict, noise: float, l
         replaced(readings, odometry, trajectory),
         trajectory,
         best.calibration,
-        moved,
-        turned,
+        *off,
         len(best.loops),
         verdict.gain.mean,
         noise=noise,

@@ -15,7 +15,7 @@ from forward_grid_mapper.core.common.readings import Floats
 from forward_grid_mapper.core.mapping import Mapper
 from forward_grid_mapper.core.trajectory import any_angle, refinement, right_angles, scan_matching
 from forward_grid_mapper.core.trajectory.any_angle import MatchedDrive
-from forward_grid_mapper.core.trajectory.attempt import Attempt, Drive
+from forward_grid_mapper.core.trajectory.attempt import ACCURACY, Attempt, Drive
 from forward_grid_mapper.core.trajectory.holding_out import Gain, held_out
 from forward_grid_mapper.core.trajectory.judging import gain_of_objective, gain_over_drive, turns_supported
 from forward_grid_mapper.core.trajectory.likelihood import scores
@@ -177,6 +177,26 @@ def test_matching_alone_that_hardly_moves_odometry_is_not_called_no_better(bent,
     assert left.reason.endswith('which is not more than the accuracy of sonar')
 
 
+def test_trajectory_that_mainly_turns_odometry_is_judged_by_readings(bent, monkeypatch) -> None:
+    """A turn of some degrees blurs the map although it hardly moves the robot."""
+    recording, odometry = bent
+    monkeypatch.setattr(right_angles, 'heading_of_walls', no_walls)
+    angle = math.radians(4.5)
+
+    def turned(odometry: Odometry, scans: Scans, *rest: object) -> MatchedDrive:
+        nodes = scans.windows.node.copy()
+        nodes[len(nodes) // 2 :, 2] += angle
+        return MatchedDrive(nodes, [], np.inf, 1.0)
+
+    monkeypatch.setattr(refinement, 'match_drive', turned)
+    monkeypatch.setattr(refinement, 'gain_at_revisits', lambda *rest: Gain(0.1, 0.01))
+    taken = Refiner(Parameters()).run(recording.readings, odometry)
+    assert taken.accepted and taken.moved < 0.15
+    assert taken.turned == pytest.approx(angle / 2, rel=0.1)
+    angle = math.radians(3.5)
+    assert not Refiner(Parameters()).run(recording.readings, odometry).accepted
+
+
 def test_usual_step_is_weighted_by_distance() -> None:
     # a hundred small steps of a robot that hardly moves, and most of the way in steps of half a metre
     along = np.concatenate([np.arange(101) * 0.01, 1.0 + np.arange(1, 11) * 0.5])
@@ -191,7 +211,7 @@ def test_drive_above_max_cells_keeps_the_trajectory_from_walls(bent, scans) -> N
     small = Scans(
         scans.windows, for_matching(Parameters.from_flat({'max_cells': 10_000})), np.zeros(1, np.uint8), scans.held_out
     )
-    assert Refiner(Parameters())._at_any_angle(drive_of._replace(scans=small), attempt, 0.15) is attempt.refinement
+    assert Refiner(Parameters())._at_any_angle(drive_of._replace(scans=small), attempt, ACCURACY) is attempt.refinement
 
 
 def test_objective_of_the_true_poses_is_larger_than_of_odometry(exact, bent, scans) -> None:
@@ -218,7 +238,7 @@ def test_reason_says_that_the_robot_came_back_only_if_it_did(bent, scans, matche
     monkeypatch.setattr(refinement, 'match_drive', lambda *rest: told)
     monkeypatch.setattr(refinement, 'has_revisits', lambda *rest: again)
     drive_of = Drive(recording.readings, odometry, scans.windows, scans)
-    found = Refiner(Parameters())._at_any_angle(drive_of, by_walls(scans, recording, odometry), 0.15)
+    found = Refiner(Parameters())._at_any_angle(drive_of, by_walls(scans, recording, odometry), ACCURACY)
     assert not found.right_angles
     assert ('where the robot came back' in found.reason) == again
     # none of the places is recognised
@@ -226,7 +246,7 @@ def test_reason_says_that_the_robot_came_back_only_if_it_did(bent, scans, matche
         '; 0% of the path through places seen before is recognised: the drive may be bent as a whole'
     )
     told = told._replace(part=LEAST_RECOGNISED)
-    found = Refiner(Parameters())._at_any_angle(drive_of, by_walls(scans, recording, odometry), 0.15)
+    found = Refiner(Parameters())._at_any_angle(drive_of, by_walls(scans, recording, odometry), ACCURACY)
     assert 'bent as a whole' not in found.reason
 
 
@@ -246,7 +266,7 @@ def test_matches_alone_replace_walls_only_with_a_much_larger_j(
     monkeypatch.setattr(refinement, 'gain_of_objective', lambda *rest: told.append(rest[1:]) or Gain(sigmas, 1.0))
     monkeypatch.setattr(refinement, 'match_drive', lambda *rest: MatchedDrive(matched, [], np.inf, 1.0))
     found = Refiner(Parameters())._at_any_angle(
-        Drive(recording.readings, odometry, scans.windows, scans), attempt, 0.15
+        Drive(recording.readings, odometry, scans.windows, scans), attempt, ACCURACY
     )
     assert (found is attempt.refinement) == (sigmas < 2.3)
     ((before, after),) = told
