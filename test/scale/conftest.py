@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from contextlib import AbstractContextManager
 from pathlib import Path
 from unittest.mock import patch
 
@@ -15,9 +16,14 @@ from forward_grid_mapper.simulation.campus import campus_drive
 from forward_grid_mapper.simulation.sonar import front_array
 
 
-@pytest.fixture(autouse=True, scope='session')
+def without_pictures() -> AbstractContextManager[object]:
+    """Return a block in which no pictures are drawn; afterwards they are, for tests of other folders."""
+    return patch.object(drawing, 'draw', lambda path, picture: path.write_bytes(b''))
+
+
+@pytest.fixture(autouse=True)
 def quick_picture() -> Iterator[None]:
-    with patch.object(drawing, 'draw', lambda path, picture: path.write_bytes(b'')):
+    with without_pictures():
         yield
 
 
@@ -34,7 +40,8 @@ def drives(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def one_process(drives: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The maps of one process, in tiles."""
     folder = tmp_path_factory.mktemp('one') / 'maps'
-    assert code_of(drives, '-o', folder, '--tiles', TILE, '-q') == 0
+    with without_pictures():
+        assert code_of(drives, '-o', folder, '--tiles', TILE, '-q') == 0
     return folder
 
 
@@ -42,7 +49,8 @@ def one_process(drives: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 def finished(drives: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder with the maps of a job in this process and, in `work`, all its tasks."""
     folder = tmp_path_factory.mktemp('finished')
-    made_here(drives, folder, Here())
+    with without_pictures():
+        made_here(drives, folder, Here())
     return folder
 
 
