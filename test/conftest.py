@@ -21,6 +21,9 @@ COMPILES = ('commands', 'test_warm_up.py')
 NO_KERNELS = ('bags', 'files')
 """Folders of tests that need no kernels, or few."""
 
+LONG = ('scale', 'test_library.py', 'test_docs.py')
+"""Folders and files that take long, but would come last, alone on one worker, if files were sorted only by name."""
+
 SHARED = Path(__file__).resolve().parents[2] / 'shared'
 
 
@@ -53,7 +56,9 @@ def turn(path: Path) -> int:
     parts = path.parts[len(HERE.parts) :]
     if parts == COMPILES:
         return 0
-    return 1 if parts[:1] and parts[0] in NO_KERNELS else 2
+    if parts[:1] and parts[0] in NO_KERNELS:
+        return 1
+    return 2 if parts[:1] and parts[0] in LONG else 3
 
 
 def pytest_configure() -> None:

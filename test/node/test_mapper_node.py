@@ -200,7 +200,8 @@ def test_services_during_em_and_after_reset(start: Any, robot: Robot) -> None:
     assert not save.success
     # a running search does not prevent the node from ending
     robot.sent = 0
-    robot.play(messages[: len(messages) // 2])
+    robot.play(messages[: len(messages) // 5])
+    robot.until(lambda: robot.diagnostics['EM']['state'] == 'idle', what='the cancelled run has ended')
     robot.ask('run_em')
     robot.until(lambda: robot.diagnostics['EM']['state'] != 'idle', what='EM runs again')
     assert node.stop(signal.SIGTERM) == 0

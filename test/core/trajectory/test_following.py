@@ -52,6 +52,11 @@ class Sample:
         end = int(np.searchsorted(o.stamp, stamp, side='right'))
         return self.readings.select(self.readings.stamp <= stamp), Odometry(o.stamp[:end], o.pose[:end])
 
+    @property
+    def half(self) -> int:
+        """The stamp in the middle of the part after the known one."""
+        return int(self.odometry.stamp[(self.known + len(self.odometry.stamp)) // 2])
+
 
 @pytest.fixture(scope='module')
 def sample() -> Sample:
@@ -63,10 +68,39 @@ def follower_of(sample: Sample) -> Follower:
 
 
 @pytest.fixture(scope='module')
-def followed(sample: Sample) -> Follower:
-    follower = follower_of(sample)
-    assert follower.follow(sample.readings, sample.odometry)
-    return follower
+def followed_by_block(sample: Sample) -> tuple[Follower, dict[str, list[float]]]:
+    """A follower of the whole drive, and what `note_blocks` noted."""
+    follower, metres = follower_of(sample), {'_judge': [], '_recognised': []}
+    with pytest.MonkeyPatch.context() as patch:
+        note_blocks(patch, metres)
+        assert follower.follow(sample.readings, sample.odometry)
+    return follower, metres
+
+
+@pytest.fixture(scope='module')
+def followed(followed_by_block: tuple[Follower, dict[str, list[float]]]) -> Follower:
+    return followed_by_block[0]
+
+
+@pytest.fixture(scope='module')
+def blocks(followed_by_block: tuple[Follower, dict[str, list[float]]]) -> dict[str, list[float]]:
+    return followed_by_block[1]
+
+
+def note_blocks(patch: pytest.MonkeyPatch, metres: dict[str, list[float]]) -> None:
+    """Note the progress at the end of each block that a follower judges or recognises."""
+
+    def noting(name: str) -> Any:
+        real = getattr(Follower, name)
+
+        def noted(self: Follower, scans: Any, nodes: Any, block: Any) -> Any:
+            metres[name].append(float(scans.windows.node_progress[block[-1]]))
+            return real(self, scans, nodes, block)
+
+        return noted
+
+    for name in metres:
+        patch.setattr(Follower, name, noting(name))
 
 
 def test_memory_of_following_is_bounded(sample: Sample, followed: Follower, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -145,9 +179,8 @@ def test_result_does_not_depend_on_portions(sample: Sample, followed: Follower, 
 
 
 def test_result_does_not_depend_on_the_order_of_readings(sample: Sample) -> None:
-    half = int(sample.odometry.stamp[(sample.known + len(sample.odometry.stamp)) // 2])
     straight, shuffled = follower_of(sample), follower_of(sample)
-    readings, odometry = sample.until(half)
+    readings, odometry = sample.until(sample.half)
     order = np.argsort(readings.stamp + np.random.default_rng(1).integers(0, LATE, len(readings)))
     straight.follow(readings, odometry)
     # late readings are there a fifth of a second later
@@ -166,7 +199,7 @@ def test_following_waits_for_complete_windows(sample: Sample) -> None:
     # odometry without readings is not sufficient
     assert not follower.follow(readings, sample.odometry)
     assert follower.windows == 0
-    assert follower.follow(sample.readings, sample.odometry)
+    assert follower.follow(*sample.until(sample.half))
 
 
 def with_stand(sample: Sample, seconds: int) -> tuple[Readings, Odometry, int]:
@@ -272,30 +305,18 @@ def test_following_continues_after_many_turns() -> None:
     assert not follower.obstacle
 
 
-def test_sparse_odometry_is_judged_and_recognised_as_often(sample: Sample, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_sparse_odometry_is_judged_and_recognised_as_often(
+    sample: Sample, blocks: dict[str, list[float]], monkeypatch: pytest.MonkeyPatch
+) -> None:
     """A step of it completes several windows, and so may not end where a block does."""
-    metres: dict[str, list[float]] = {'_judge': [], '_recognised': []}
-
-    def noting(name: str) -> Any:
-        real = getattr(Follower, name)
-
-        def noted(self: Follower, scans: Any, nodes: Any, block: Any) -> Any:
-            metres[name].append(float(scans.windows.node_progress[block[-1]]))
-            return real(self, scans, nodes, block)
-
-        return noted
-
-    for name in metres:
-        monkeypatch.setattr(Follower, name, noting(name))
-    o, counts = sample.odometry, []
-    for thinned in (1, 100):
-        kept = np.union1d(np.arange(0, len(o.stamp), thinned), len(o.stamp) - 1)
-        begun = kept[kept <= sample.known]
-        known = Correction(*(Odometry(o.stamp[begun], path.pose[begun]) for path in (o, sample.true)))
-        Follower(known, {}, Parameters()).follow(sample.readings, Odometry(o.stamp[kept], o.pose[kept]))
-        counts.append([len(found) for found in metres.values()])
-        for found in metres.values():
-            found.clear()
+    sparse: dict[str, list[float]] = {name: [] for name in blocks}
+    note_blocks(monkeypatch, sparse)
+    o = sample.odometry
+    kept = np.union1d(np.arange(0, len(o.stamp), 100), len(o.stamp) - 1)
+    begun = kept[kept <= sample.known]
+    known = Correction(*(Odometry(o.stamp[begun], path.pose[begun]) for path in (o, sample.true)))
+    Follower(known, {}, Parameters()).follow(sample.readings, Odometry(o.stamp[kept], o.pose[kept]))
+    counts = [[len(found) for found in metres.values()] for metres in (blocks, sparse)]
     assert min(counts[0]) > 3
     assert np.abs(np.subtract(*counts)).max() <= 1
 
@@ -332,7 +353,8 @@ def test_correction_that_predicts_worse_is_not_used(sample: Sample, monkeypatch:
     follower = follower_of(sample)
     follower.follow(*sample.until(sample.correction.end))
     monkeypatch.setattr(following, 'yaws_of_votes', astray)
-    follower.follow(sample.readings, sample.odometry)
+    follower.follow(*sample.until(sample.half))
+    assert follower.windows > 5
     assert follower.kept
     assert follower.correction is sample.correction
 
@@ -452,6 +474,5 @@ def test_following_compiles_no_kernels(sample: Sample) -> None:
     warm_up.warm_up_trajectory()
     kernels = [walls.count_votes, likelihood.score_poses, likelihood._set_unknown, windows.mark_still]
     before = [len(kernel.signatures) for kernel in kernels]
-    half = int(sample.odometry.stamp[(sample.known + len(sample.odometry.stamp)) // 2])
-    follower_of(sample).follow(*sample.until(half))
+    follower_of(sample).follow(*sample.until(sample.half))
     assert [len(kernel.signatures) for kernel in kernels] == before
