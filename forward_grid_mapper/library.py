@@ -76,7 +76,7 @@ class Sonar:
         if not finite:
             raise InputError(f'{self}: pose and limits must be finite')
         if not 0.0 < self.field_of_view < math.pi:
-            degrees = f'; did you mean radians({self.field_of_view:g})?' if 0 < self.field_of_view < 180 else ''
+            degrees = f'; did you mean radians({self.field_of_view:g})?' if 4 < self.field_of_view < 180 else ''
             raise InputError(f'field_of_view = {self.field_of_view:g} is not an angle between 0 and pi rad{degrees}')
         if not 0.0 <= self.min_range < self.max_range:
             raise InputError(

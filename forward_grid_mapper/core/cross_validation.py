@@ -134,6 +134,6 @@ def only_if_validated(
         estimates={},
         accepted=0,
         maps=Mapper(parameters).run(readings, watch),
-        warnings=(*found.warnings, why),
+        warnings=(why, *(f'of the refused values: {warning}' for warning in found.warnings)),
         cross_validation=validation,
     )

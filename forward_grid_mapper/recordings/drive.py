@@ -194,6 +194,19 @@ def length_of(associator: PoseAssociator) -> float:
     return max(float(whole - steps[jumped].sum()), 0.0)
 
 
+def length_between(associator: PoseAssociator, first: int, last: int) -> float:
+    """Return the distance driven between two stamps, nanoseconds, as `length_of` does for the whole drive."""
+    stamp, pose = associator.record.snapshot()
+    inside = (stamp >= first) & (stamp <= last)
+    path = RobotPath()
+    for x, y in pose[inside, :2].tolist():
+        path.extend((x, y))
+    points = np.array(path.points, np.float64).reshape(-1, 2)
+    steps, jumped = _steps(associator)
+    both = inside[:-1] & inside[1:]
+    return max(float(np.hypot(*np.diff(points, axis=0).T).sum() - steps[jumped & both].sum()), 0.0)
+
+
 def jumps_note(associator: PoseAssociator) -> list[str]:
     """Return a note if odometry jumps, for users who map without refinement; not if it seems to consist of jumps."""
     steps, jumped = _steps(associator)

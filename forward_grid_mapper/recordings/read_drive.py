@@ -26,7 +26,7 @@ from ..core.messages.rep117 import ODOMETRY_REASONS, REASONS, rejection_warnings
 from ..files.journal import drive_file
 from ..files.output_folder import readable
 from .bag_extrinsics import BagExtrinsics
-from .drive import WHOLE, Drive, FullLiveMap, Part, Spans, alternation_note, length_of, thinning_note
+from .drive import WHOLE, Drive, FullLiveMap, Part, Spans, alternation_note, length_between, length_of, thinning_note
 from .given_poses import GivenPoses
 from .journal_drive import read_journal
 from .other_bags import OtherBags
@@ -135,7 +135,8 @@ def read_drive(
         'extrinsics': lookup.poses,
         'stamps': [first, last],
         'duration_s': (last - first) / NANOSECONDS,
-        'path_m': length_of(associator),
+        # of a part, some odometry before and after it is read as well
+        'path_m': length_of(associator) if part.whole else length_between(associator, first, last),
         'counts': {
             'received': associator.received,
             'accepted': len(associator.buffer),

@@ -9,7 +9,7 @@ import pytest
 
 from forward_grid_mapper.core.messages.message_types import OdometryMessage, Pose2
 from forward_grid_mapper.core.messages.pose_association import PoseAssociator
-from forward_grid_mapper.recordings.drive import alternation_note, jumps_note, length_of, path_of
+from forward_grid_mapper.recordings.drive import alternation_note, jumps_note, length_between, length_of, path_of
 
 
 def drive(order: np.ndarray, stamps: np.ndarray) -> PoseAssociator:
@@ -34,6 +34,13 @@ def test_length_with_poses_out_of_order_is_that_of_sorted_poses(seed: int) -> No
     assert np.array_equal(path_of(mixed), path_of(straight))
     arrived = np.hypot(*np.diff(np.array(mixed.path), axis=0).T).sum()
     assert arrived > 1.5 * length_of(mixed), 'the sample is out of order'
+
+
+def test_length_between_two_stamps_is_that_of_the_poses_between_them() -> None:
+    stamps = np.arange(1, 102) * 50_000_000
+    straight = drive(np.arange(101), stamps)
+    assert length_between(straight, int(stamps[20]), int(stamps[50])) == pytest.approx(3.0, abs=0.1)
+    assert length_between(straight, 0, int(stamps[-1])) == length_of(straight)
 
 
 def test_path_of_poses_in_order_is_unchanged() -> None:

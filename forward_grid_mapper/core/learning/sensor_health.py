@@ -52,6 +52,8 @@ DEAF_NO_ECHO, DEAF_MISSED = 0.95, 0.2
 """A sensor that detects nothing has at least these fractions of max-range readings and of missed obstacles."""
 DEAF_RANDOM_ECHOES = 0.5
 """At least this fraction of its few echoes is random."""
+RANDOM_VERDICTS = ('mostly random', 'often random')
+"""Verdicts that drift of odometry gives as well."""
 SUSPECT_SHORT = 0.5
 SUSPECT_RANDOM = 0.5
 SUSPECT_RANDOM_WITH_OTHERS = 0.3
@@ -95,7 +97,7 @@ class SensorHealth:
     @property
     def suspect(self) -> bool:
         """Whether the sensor seems to be broken, badly mounted or given a wrong pose."""
-        return self.verdict in ('never hears anything', 'always short', 'mostly random', 'often random')
+        return self.verdict in ('never hears anything', 'always short', *RANDOM_VERDICTS)
 
     @property
     def verdict_text(self) -> str:
@@ -339,4 +341,10 @@ def health_warning(table: dict[str, SensorHealth]) -> str:
         finding = 'the only sensor does not fit the map'
     else:
         finding = f'{"a sensor stands" if len(suspects) == 1 else f"{len(suspects)} sensors stand"} out from the others'
-    return f'{finding}: {", ".join(suspects)}; broken, covered, or with a wrong pose?'
+    causes = 'broken, covered, or with a wrong pose?'
+    if sum(row.suspect and row.verdict in RANDOM_VERDICTS for row in table.values()) > 1:
+        causes = (
+            'broken, covered, or with a wrong pose, or does odometry drift (refine_poses)? It shows first in sensors '
+            'that look along walls'
+        )
+    return f'{finding}: {", ".join(suspects)}; {causes}'
