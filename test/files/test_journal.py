@@ -281,16 +281,15 @@ def test_nearly_full_disk_takes_what_fits_with_one_warning(tmp_path: Path, monke
     warnings: list[str] = []
     journal, _ = opened(tmp_path, warnings)
     written(journal, made(0, 10))
+    database = journal._writer._database
+    assert database is not None
     with no_room(journal):
         for k in range(1, 101):
             journal.put(made(100 * k, 100), FRAMES)
         until(lambda: journal.trouble)
-    database = journal._writer._database
-    assert database is not None
-    for pages in (60, 100, 120):
-        # another program frees some space, again and again; the readings need 200 pages
-        before = journal.unwritten
-        with no_room(journal):
+        for pages in (60, 100, 120):
+            # another program frees some space, again and again; the readings need 200 pages
+            before = journal.unwritten
             database.execute(f'PRAGMA max_page_count={pages}')
             until(lambda before=before: journal.unwritten < before - 500)
             time.sleep(0.1)
