@@ -80,12 +80,12 @@ def test_bag_with_flipped_bits_is_read_or_rejected_in_time(tmp_path: Path, kind:
         for _ in range(rng.choice((1, 1, 20))):
             damaged[rng.randrange(len(damaged))] ^= 1 << rng.randrange(8)
         file.write_bytes(damaged)
-        begin = time.monotonic()
+        begin = time.process_time()
         try:
             read(rng.choice((bag, file)))
         except MapperError as error:
             assert str(error)
-        assert time.monotonic() - begin < 5.0
+        assert time.process_time() - begin < 5.0
 
 
 def test_metadata_with_flipped_bits_is_read_or_rejected(tmp_path: Path) -> None:
