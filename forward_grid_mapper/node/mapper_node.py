@@ -41,8 +41,8 @@ from .saver import Account, Saver
 from .trajectory import Trajectory
 
 FEED_PERIOD = 0.1
-"""Longest time between two transfers of readings to the maps, seconds. Each wakes the executor, which takes about 2 ms
-of a core even if there is nothing to do."""
+"""Longest time between two transfers of readings to the maps, seconds. Each wakes the executor, which takes time even
+if there is nothing to do."""
 
 
 class MapperNode(ManagedNode):

@@ -180,31 +180,35 @@ def path_of(associator: PoseAssociator) -> NDArray[np.float64]:
     points, record = associator.path, associator.record
     # the record begins again after the clock jumped back
     if record.late and not associator.time_jumps:
-        path = RobotPath()
-        for x, y in record.snapshot()[1][:, :2].tolist():
-            path.extend((x, y))
-        points = path.points
+        return _path_through(record.snapshot()[1])
     return np.array(points, np.float64).reshape(-1, 2)
+
+
+def _path_through(poses: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the path through poses, shape (M, 3), as the associator keeps it while they arrive."""
+    path = RobotPath()
+    for x, y in poses[:, :2].tolist():
+        path.extend((x, y))
+    return np.array(path.points, np.float64).reshape(-1, 2)
 
 
 def length_of(associator: PoseAssociator) -> float:
     """Return the distance driven by the robot, metres, without jumps of odometry."""
-    whole = np.hypot(*np.diff(path_of(associator), axis=0).T).sum()
     steps, jumped = _steps(associator)
-    return max(float(whole - steps[jumped].sum()), 0.0)
+    return _length(path_of(associator), steps[jumped])
 
 
 def length_between(associator: PoseAssociator, first: int, last: int) -> float:
     """Return the distance driven between two stamps, nanoseconds, as `length_of` does for the whole drive."""
     stamp, pose = associator.record.snapshot()
     inside = (stamp >= first) & (stamp <= last)
-    path = RobotPath()
-    for x, y in pose[inside, :2].tolist():
-        path.extend((x, y))
-    points = np.array(path.points, np.float64).reshape(-1, 2)
     steps, jumped = _steps(associator)
-    both = inside[:-1] & inside[1:]
-    return max(float(np.hypot(*np.diff(points, axis=0).T).sum() - steps[jumped & both].sum()), 0.0)
+    return _length(_path_through(pose[inside]), steps[jumped & inside[:-1] & inside[1:]])
+
+
+def _length(path: NDArray[np.float64], jumps: NDArray[np.float64]) -> float:
+    """Return the length of a path, shape (P, 2), without the steps that are jumps; metres."""
+    return max(float(np.hypot(*np.diff(path, axis=0).T).sum() - jumps.sum()), 0.0)
 
 
 def jumps_note(associator: PoseAssociator) -> list[str]:

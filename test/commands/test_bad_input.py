@@ -85,9 +85,12 @@ def test_ranges_that_no_sonar_measures_are_an_error_and_not_a_huge_map(
 ) -> None:
     error = error_of_drive(capsys, tmp_path, in_units(*by))
     assert expected in error and 'set the parameter max_range' in error
-    if by == (1, 100):
-        report = mapped(tmp_path / 'bag', tmp_path / 'maps', '-q', '--set', 'max_range=5.0')
-        assert report['counts']['accepted'] == COUNT
+
+
+def test_drive_with_limits_in_centimetres_is_mapped_once_max_range_is_set(tmp_path: Path) -> None:
+    bag = write_tape(tmp_path / 'bag', in_units(1, 100))
+    report = mapped(bag, tmp_path / 'maps', '-q', '--set', 'max_range=5.0')
+    assert report['counts']['accepted'] == COUNT
 
 
 def test_no_limit_is_a_warning(tmp_path: Path) -> None:

@@ -45,7 +45,7 @@ class TileInput(NamedTuple):
     normals : float32, shape (2, *box.shape)
         x and y of the surface normals (`SurfaceNormals`), 0 if unknown.
     ml : int8, shape `box.shape`
-        The final map; only for `judged`.
+        The final map; only for `judge_readings`.
     """
 
     tile: Tile
