@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from drive_samples import FILES, arrays_in, error_of, mapped, tape, write_tape
 
+from forward_grid_mapper.commands.process_bag import SMALLEST_TILE
 from forward_grid_mapper.files import drawing
 
 
@@ -36,7 +37,13 @@ def test_tile_larger_than_all_maps_is_the_whole_map(tmp_path: Path, size: float)
     assert mapped(bag, tmp_path / 'maps', '--tiles', size)['statistics']['tiles'] == 1
 
 
-@pytest.mark.parametrize('size', ['0', '-5', 'nan', 'inf'])
+def test_tiles_may_have_the_smallest_size(tmp_path: Path) -> None:
+    bag = write_tape(tmp_path / 'bag', tape())
+    report = mapped(bag, tmp_path / 'maps', '--tiles', SMALLEST_TILE, '--set', 'max_iterations=1')
+    assert report['statistics']['tiles'] > 20
+
+
+@pytest.mark.parametrize('size', ['0', '-5', f'{SMALLEST_TILE - 0.1}', 'nan', 'inf'])
 def test_impossible_size_of_tiles_is_rejected(tmp_path: Path, size: str, capsys: pytest.CaptureFixture[str]) -> None:
     bag = write_tape(tmp_path / 'bag', tape())
     assert f'--tiles {size}: give the edge' in error_of(

@@ -11,11 +11,17 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from scaled_jobs import code_of, scaled
+from scaled_jobs import Here, code_of, job_in, scaled
+
+sys.path.insert(0, str(Path(__file__).parents[1] / 'files'))
+
+from journal_samples import FRAMES, made, opened
 
 from forward_grid_mapper.commands import process_bag
 from forward_grid_mapper.core.common.errors import ClusterError, OutputError
-from forward_grid_mapper.scale.job import check_versions, plan_of, versions
+from forward_grid_mapper.core.messages.message_types import Pose2
+from forward_grid_mapper.recordings.drive import WHOLE
+from forward_grid_mapper.scale.job import DriveArguments, Job, check_versions, plan_of, versions
 from forward_grid_mapper.scale.work_folder import WorkFolder, whole
 
 
@@ -30,6 +36,36 @@ def test_options_without_effect_are_reported_with_workers(drives: Path, monkeypa
     monkeypatch.setattr(process_bag, 'with_workers', with_workers)
     assert code_of(drives, '--workers', 2, '--set', 'odometry_noise=2deg') == 0
     assert reported == ['odometry_noise has an effect only with --refine-poses, which is not given']
+
+
+@scaled
+def test_workers_map_all_readings_whatever_max_readings_is(
+    drives: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from forward_grid_mapper.scale import cluster, mapping
+
+    given: list[int] = []
+
+    def interrupted(workers: Here, job: Job, *_: object) -> None:
+        given.append(job.parameters.association.max_readings)
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(cluster, 'Cluster', lambda *_: Here())
+    monkeypatch.setattr(mapping, 'ScaledMapper', interrupted)
+    assert code_of(drives, '-o', tmp_path / 'maps', '--workers', 1, '--set', 'max_readings=5000') == 130
+    assert given == [0]
+
+
+@scaled
+def test_poses_of_sensors_given_for_a_journal_are_reported(tmp_path: Path) -> None:
+    from forward_grid_mapper.scale.placing import place
+
+    journal, _ = opened(tmp_path / 'journal')
+    journal.put(made(0, 50), FRAMES, [(0.0, 0.0)])
+    journal.close()
+    given = DriveArguments((str(tmp_path / 'journal'),), {'left': Pose2(0.0, 0.0, 0.0)}, None, None, WHOLE)
+    placed = place(job_in(tmp_path / 'work'), 0, given)
+    assert [text for text in placed['source']['warnings'] if 'given poses of sensors have no effect' in text]
 
 
 def test_missing_extra_is_reported_with_a_remedy(

@@ -177,6 +177,10 @@ def test_visible_surface_ends_at_the_largest_range_and_at_walls(door):
     assert columns[-1] == math.floor((wall.x[0] + half) / 0.1)
     short = replace(wall, z_max=np.array([0.5]))
     assert not visible_surface(world, short).any()
+    # each reading has its own largest range, also next to one with a larger one
+    back = wall.yaw[0] + np.array([0.0, math.pi])
+    away = replace(wall.select(np.array([0, 0])), yaw=back, z_max=np.array([0.5, 5.0]))
+    np.testing.assert_array_equal(visible_surface(world, away), visible_surface(world, away.select(np.array([1]))))
 
 
 def test_visible_surface_of_first_echoes_is_smaller(door):

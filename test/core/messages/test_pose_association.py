@@ -430,6 +430,23 @@ def test_readings_of_a_sensor_with_clock_ahead_do_not_accumulate() -> None:
     assert accounted(p)
 
 
+@pytest.mark.parametrize('seed', range(3))
+def test_readings_are_placed_by_stamp_after_others_from_the_future_are_rejected(seed: int) -> None:
+    clock, stamps = Clock(), random.Random(seed).sample(range(500, 600), 60)
+    p = associator(clock=clock)
+    p.add_odometry(odometry(0.0))
+    for stamp in stamps[:30]:
+        p.add_range(sonar(stamp / 100))
+    p.add_odometry(odometry(1.9))
+    clock.now = 10.0
+    for stamp in stamps[30:]:
+        p.add_range(sonar(stamp / 100))
+    for tenth in range(20, 61):
+        p.add_odometry(odometry(tenth / 10))
+    assert p.rejected == {'from_the_future': 30}
+    assert p.readings.stamp.tolist() == [stamp * NANOSECONDS // 100 for stamp in sorted(stamps[30:])]
+
+
 def test_readings_wait_while_odometry_has_constant_stamps() -> None:
     clock = Clock()
     p = associator(clock=clock)
