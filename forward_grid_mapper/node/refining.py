@@ -18,6 +18,7 @@ from ..core.common.words import counted
 from ..core.mapping import Mapper, Watch
 from ..core.maps.log_odds_map import LogOddsMap
 from ..core.maps.map_set import MapSet
+from ..core.runtime.threads import cores
 from ..core.trajectory.correction import Correction
 from ..core.trajectory.following import Follower
 from ..core.trajectory.keeping import keep_if_not_worse
@@ -28,6 +29,11 @@ from .background import reason
 
 BATCH = 20_000
 """Readings after which the construction of a live map checks for cancellation."""
+
+
+def leaving_a_core(parameters: Parameters) -> Parameters:
+    """Return the parameters of a refinement, which takes long: messages have a core, unless `threads` is given."""
+    return parameters.varied({'threads': parameters.search.threads or max(cores() - 1, 1)})
 
 
 class RefinementInput(NamedTuple):
@@ -89,7 +95,8 @@ class RefiningMapper:
         self._parameters, self._drive = parameters, drive
         self._to_refine, self._before = refine, before
         self._stop, self._kept = np.zeros(1, np.uint8), ''
-        self._mapper, self._refiner = Mapper(parameters), Refiner(parameters)
+        self._mapper, self._matching = Mapper(parameters), leaving_a_core(parameters)
+        self._refiner = Refiner(self._matching)
         self._cancelled, self._moves = False, before is not None
 
     def cancel(self) -> None:
@@ -166,7 +173,7 @@ class RefiningMapper:
         if found.accepted or before is None or before.refinement is None or before.correction is None:
             return found
         say('that of the previous run', 0.0)
-        outcome = keep_if_not_worse(before.refinement, before.correction, found, self._parameters, self._stop)
+        outcome = keep_if_not_worse(before.refinement, before.correction, found, self._matching, self._stop)
         if outcome.accepted:
             self._kept = found.reason
         return outcome

@@ -19,6 +19,7 @@ from inside import Inside
 from refined_robot import HeldRun, assert_live, live_of, odometry_of, refined
 
 from forward_grid_mapper.core.common.errors import Cancelled
+from forward_grid_mapper.core.common.parameters import Parameters
 from forward_grid_mapper.core.trajectory import keeping
 from forward_grid_mapper.core.trajectory.holding_out import Gain
 from forward_grid_mapper.core.trajectory.windows import Odometry
@@ -308,6 +309,14 @@ def test_reset_deletes_the_trajectory(inside: Callable[..., Inside], quick: Any)
     # the drive is the one since the reset
     assert len(odometry_of(robot).stamp) <= 32
     assert robot.node.associator.record.newest is not None
+
+
+@pytest.mark.parametrize(('cores', 'given', 'expected'), [(1, 0, 1), (2, 0, 1), (8, 0, 7), (8, 8, 8), (8, 2, 2)])
+def test_refinement_leaves_a_core_for_messages_unless_threads_are_given(
+    monkeypatch: pytest.MonkeyPatch, cores: int, given: int, expected: int
+) -> None:
+    monkeypatch.setattr(refining, 'cores', lambda: cores)
+    assert refining.leaving_a_core(Parameters.from_flat({'threads': given})).search.threads == expected
 
 
 def test_reset_and_cancel_end_a_refinement(inside: Callable[..., Inside], monkeypatch: pytest.MonkeyPatch) -> None:

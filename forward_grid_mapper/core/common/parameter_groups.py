@@ -208,7 +208,13 @@ class SearchParameters:
     max_iterations: int = param(
         1000, 'Bound on the iterations of the search; the report says if it was reached.', 'iterations', 1, 100_000
     )
-    threads: int = param(0, 'Threads of a search, 0 for one per core; the maps do not depend on it.', 'threads', 0, 256)
+    threads: int = param(
+        0,
+        'Threads of a search, and of scan matching; 0 for one per core. Maps and trajectories do not depend on it.',
+        'threads',
+        0,
+        256,
+    )
     max_memory: int = param(
         4000,
         'Memory for pairs of cells and readings; beyond it they are computed again each time: the same maps, slower.',

@@ -5,11 +5,15 @@ from __future__ import annotations
 import itertools
 import math
 import os
-from collections.abc import Callable
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor, wait
 from pathlib import Path
+from typing import TypeVar
 
 from .control_groups import control_groups
+
+T = TypeVar('T')
 
 LEAST_PART = 5000
 """Fewest readings for which another thread saves time."""
@@ -89,3 +93,37 @@ def _run(job: Callable[[], None], end: Future[None], k: int, errors: dict[int, B
     except BaseException as error:
         errors[k] = error
     end.set_result(None)
+
+
+def in_order(work: Iterable[Callable[[], T]], threads: int) -> Iterator[T]:
+    """Run each of `work` on so many threads, and yield the results in the order of `work`.
+
+    At most two results for each thread are kept before they are asked for. With one thread, work runs in the calling
+    one, and so does work for which the system starts no thread; another thread may then run it as well, so it must not
+    change anything. If work fails, its exception is raised in the place of its result. After that, or if the iteration
+    ends early, no more work begins.
+    """
+    if threads <= 1:
+        for job in work:
+            yield job()
+        return
+    pool, ahead = ThreadPoolExecutor(threads), deque[Future[T]]()
+    try:
+        for job in work:
+            ahead.append(_begun(job, pool))
+            if len(ahead) == 2 * threads:
+                yield ahead.popleft().result()
+        while ahead:
+            yield ahead.popleft().result()
+    finally:
+        pool.shutdown(cancel_futures=True)
+
+
+def _begun(job: Callable[[], T], pool: ThreadPoolExecutor) -> Future[T]:
+    """Return the result of a job, which a thread of the pool computes, or this one if the system starts none."""
+    try:
+        return pool.submit(job)
+    except (RuntimeError, MemoryError):
+        done = Future[T]()
+        done.set_result(job())
+        return done

@@ -10,12 +10,14 @@ are used in no match, map or vote; their poses are interpolated from those of th
 from __future__ import annotations
 
 import hashlib
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..common.readings import Floats
+from ..runtime.threads import in_order
 from .likelihood import scores
 from .passes import Progress
 from .poses import relative
@@ -67,14 +69,13 @@ def predicted(
         Receives the fraction of the work that is done.
     """
     along = hashlib.sha256(nodes.tobytes()).digest()
-    out = np.empty(len(blocks))
-    for i, block in enumerate(blocks):
-        key = along, block.tobytes(), span
-        if key not in scans.predictions:
-            watch(i / len(blocks))
-            scans.predictions[key] = _predicted(scans, nodes, block, span)
-        out[i] = scans.predictions[key]
-    return out
+    keys = [(along, block.tobytes(), span) for block in blocks]
+    new = {key: block for key, block in zip(keys, blocks, strict=True) if key not in scans.predictions}
+    work = [partial(_predicted, scans, nodes, block, span) for block in new.values()]
+    for done, (key, value) in enumerate(zip(new, in_order(work, scans.threads), strict=True)):
+        watch(done / len(new))
+        scans.predictions[key] = value
+    return np.array([scans.predictions[key] for key in keys], np.float64)
 
 
 def _predicted(scans: Scans, nodes: Floats, block: NDArray[np.int64], span: float) -> float:

@@ -102,11 +102,13 @@ def local_map(readings: Readings, parameters: Parameters, stop: NDArray[np.uint8
     Cancelled
         If `stop` was set.
     """
-    grid, evidence, traversed, _ = _searched(readings, parameters, stop, OF_LOCAL_MAPS)
+    grid, evidence, traversed, _ = _searched(readings, parameters, stop, OF_LOCAL_MAPS, 1)
     return soft_map(evidence, grid, traversed, parameters.model)
 
 
-def explained(readings: Readings, parameters: Parameters, stop: NDArray[np.uint8]) -> tuple[float, Floats]:
+def explained(
+    readings: Readings, parameters: Parameters, stop: NDArray[np.uint8], threads: int
+) -> tuple[float, Floats]:
     """Return the objective J of the map that the search finds, and the log-likelihood of each reading in it.
 
     Both are in nats. The log-likelihoods, shape (N,), are tempered; with the prior of the map they add up to J.
@@ -116,17 +118,17 @@ def explained(readings: Readings, parameters: Parameters, stop: NDArray[np.uint8
     Cancelled
         If `stop` was set.
     """
-    _, evidence, _, found = _searched(readings, parameters, stop, memory_for_pairs(parameters))
+    _, evidence, _, found = _searched(readings, parameters, stop, memory_for_pairs(parameters), threads)
     each = parameters.model.likelihood_exponent * evidence.log_likelihoods
     return evidence.tempered_log_likelihood + found.log_prior, each
 
 
 def _searched(
-    readings: Readings, parameters: Parameters, stop: NDArray[np.uint8], memory: float
+    readings: Readings, parameters: Parameters, stop: NDArray[np.uint8], memory: float, threads: int
 ) -> tuple[Grid, Evidence, NDArray[np.bool_], SearchResult]:
     """Return the grid of readings, their evidence, the traversed cells, and the result of the search."""
     grid = grid_of(readings, parameters.model, parameters.grid)
-    evidence = Evidence(grid, parameters.model, memory, 1, stop)
+    evidence = Evidence(grid, parameters.model, memory, threads, stop)
     evidence.extend(readings)
     traversed = traversed_cells(readings, grid)
     return grid, evidence, traversed, Search(evidence, parameters.search, traversed.ravel()).run()

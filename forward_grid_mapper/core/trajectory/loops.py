@@ -10,13 +10,17 @@ other pose in the area. Loop closures that disagree with the rest are removed wh
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+import threading
+from collections import defaultdict
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..common.readings import Floats
+from ..runtime.threads import in_order
 from .local_map import LocalMap
 from .matching import climbed, measure
 from .passes import FEWEST, Matches, Progress
@@ -91,18 +95,20 @@ SearchResults = dict[tuple[int, int], Loop | None]
 
 
 class Places:
-    """Local maps around nodes, each made when it is first used."""
+    """Local maps around nodes, each made when it is first used; threads wait for a map that another one makes."""
 
     def __init__(self, scans: Scans, nodes: Floats) -> None:
         self._scans, self._nodes = scans, nodes
         self._maps: dict[int, LocalMap | None] = {}
+        self._made: defaultdict[int, threading.Lock] = defaultdict(threading.Lock)
 
     def __getitem__(self, node: int) -> LocalMap | None:
-        if node not in self._maps:
-            progress = self._scans.windows.node_progress
-            members = np.flatnonzero(np.abs(progress - progress[node]) < AROUND)
-            self._maps[node] = self._scans.map(members, self._nodes[node], self._nodes)
-        return self._maps[node]
+        with self._made[node]:
+            if node not in self._maps:
+                progress = self._scans.windows.node_progress
+                members = np.flatnonzero(np.abs(progress - progress[node]) < AROUND)
+                self._maps[node] = self._scans.map(members, self._nodes[node], self._nodes)
+            return self._maps[node]
 
 
 def candidates(
@@ -145,9 +151,9 @@ def candidates(
 
 
 def find_loop(
-    scans: Scans, block: NDArray[np.int64], nodes: Floats, place: int, sigma: Floats, around: LocalMap, usual: float
+    scans: Scans, block: NDArray[np.int64], nodes: Floats, place: int, sigma: Floats, places: Places, usual: float
 ) -> Loop | None:
-    """Return the loop closure of a block with a place; None if it is not recognised there.
+    """Return the loop closure of a block with a place; None if it is not recognised there, or the place has no map.
 
     Parameters
     ----------
@@ -159,11 +165,13 @@ def find_loop(
         Node of the place.
     sigma : float64, shape (3,)
         σ of the pose of the block relative to the place: metres, metres, radians.
-    around : LocalMap
-        Of the place.
+    places : Places
     usual : float
         Usual log-likelihood ratio of a reading, nats.
     """
+    around = places[place]
+    if around is None:
+        return None
     middle = block[len(block) // 2]
     shape = relative(nodes[middle], nodes[block])
     joint = scans.joint(block, shape)
@@ -206,10 +214,9 @@ def find_loops(
     known : dict, optional
         Results that are taken over without a search.
     """
-    known = known or {}
+    known, work = known or {}, dict[tuple[int, int], Callable[[], Loop | None]]()
     places, out, progress = Places(scans, nodes), SearchResults(), scans.windows.node_progress
     for k in range(0, len(nodes) - LENGTH // 2, LENGTH):
-        watch(k / len(nodes))
         block = np.arange(k, min(k + LENGTH, len(nodes)))
         if scans.count[block].sum() < FEWEST_ON_MAP:
             continue
@@ -217,10 +224,12 @@ def find_loops(
         found = {key: loop for key, loop in known.items() if key[0] == middle and loop is not None}
         out.update(found)
         for place, sigma in candidates(nodes, samples, progress, middle, [place for _, place in found]):
-            if (middle, place) in known:
-                out[middle, place] = None
-            elif (around := places[place]) is not None:
-                out[middle, place] = find_loop(scans, block, nodes, place, sigma, around, usual)
+            out[middle, place] = None
+            if (middle, place) not in known:
+                work[middle, place] = partial(find_loop, scans, block, nodes, place, sigma, places, usual)
+    for done, (key, loop) in enumerate(zip(work, in_order(work.values(), scans.threads), strict=True)):
+        watch(done / len(work))
+        out[key] = loop
     return out
 
 

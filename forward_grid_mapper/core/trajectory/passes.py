@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..common.readings import Floats
+from ..runtime.threads import in_order
 from .matching import Match, measure
 from .pose_graph import Edges, no_edges
 from .poses import relative, rms_after_alignment
@@ -25,6 +27,9 @@ AROUND = 4.0
 
 FEWEST = 3
 """Fewest readings of a window that is matched, and fewest windows of a map."""
+
+Row = tuple[int, int, Match, int]
+"""A match: the node of the place, the window, the match of the window there, and its number of readings."""
 
 Progress = Callable[[float], None]
 """Receives the fraction of the work that is done, from 0 to 1."""
@@ -92,40 +97,48 @@ def match_preceding(scans: Scans, nodes: Floats, watch: Progress) -> Matches:
     The block and that map overlap about `BACK` behind the block, so the edges begin at the node there. These matches
     give the scale of odometry. Those with a map of both sides do not: such a map is stretched as the trajectory is.
     """
-    w, found = scans.windows, Matches()
+    w, work = scans.windows, []
     for k in range(0, len(nodes), BLOCK):
-        watch(k / len(nodes))
         block = np.arange(k, min(k + BLOCK, len(nodes)))
         behind = w.node_progress[k] - w.node_progress[:k]
         members = np.flatnonzero(behind < BEHIND)
         if len(members) >= FEWEST:
             place = int(members[np.abs(behind[members] - BACK).argmin()])
-            _match(scans, nodes, block, members, place, found)
-    return found
+            work.append(partial(_matches, scans, nodes, block, members, place))
+    return _found(scans, work, watch)
 
 
 def match_surrounding(scans: Scans, nodes: Floats, watch: Progress) -> Matches:
     """Return the matches of each block with the map of `AROUND` metres before and after it, at the present nodes."""
-    w, found = scans.windows, Matches()
+    w, work = scans.windows, []
     for k in range(0, len(nodes), BLOCK):
-        watch(k / len(nodes))
         block = np.arange(k, min(k + BLOCK, len(nodes)))
         near = np.abs(w.node_progress - w.node_progress[block].mean()) < AROUND
         near[block] = False
         members = np.flatnonzero(near)
-        if len(members) < FEWEST:
-            continue
-        _match(scans, nodes, block, members, int(members[0]), found)
+        if len(members) >= FEWEST:
+            work.append(partial(_matches, scans, nodes, block, members, int(members[0])))
+    return _found(scans, work, watch)
+
+
+def _found(scans: Scans, work: Sequence[Callable[[], list[Row]]], watch: Progress) -> Matches:
+    """Return the matches of all blocks."""
+    found = Matches()
+    for done, rows in enumerate(in_order(work, scans.threads)):
+        watch(done / len(work))
+        for row in rows:
+            found.add(*row)
     return found
 
 
-def _match(
-    scans: Scans, nodes: Floats, block: NDArray[np.int64], members: NDArray[np.int64], place: int, found: Matches
-) -> None:
-    """Add the matches of a block's windows with the map of the windows `members`, in the frame of the node `place`."""
+def _matches(
+    scans: Scans, nodes: Floats, block: NDArray[np.int64], members: NDArray[np.int64], place: int
+) -> list[Row]:
+    """Return the matches of a block's windows with the map of the windows `members`, in the frame of `place`."""
     around = scans.map(members, nodes[place], nodes)
     if around is None:
-        return
-    for j in block[scans.count[block] >= FEWEST]:
-        match = measure(scans.scan[j], around, relative(nodes[place], nodes[j]))
-        found.add(place, int(j), match, int(scans.count[j]))
+        return []
+    return [
+        (place, int(j), measure(scans.scan[j], around, relative(nodes[place], nodes[j])), int(scans.count[j]))
+        for j in block[scans.count[block] >= FEWEST]
+    ]

@@ -181,8 +181,7 @@ def loops_at(scans: Scans, nodes: Floats, stretch: NDArray[np.int64], usual: flo
         if scans.count[block].sum() < FEWEST_ON_MAP or far.min(initial=np.inf) > LOOP_REACH:
             continue
         place = int(before[far.argmin()])
-        around = places[place]
-        loop = None if around is None else find_loop(scans, block, nodes, place, SIGMA, around, usual)
+        loop = find_loop(scans, block, nodes, place, SIGMA, places, usual)
         if loop is not None:
             out.append(loop)
     return out

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from ..common.parameters import Parameters
 from ..common.readings import Floats, Readings
+from ..runtime.threads import cores
 from ..sensor.density import hit_probability
 from .likelihood import Scan, make_scan
 from .local_map import UNKNOWN, LocalMap, at_poses, explained, local_map
@@ -37,6 +38,8 @@ class Scans:
         Windows whose readings are only predicted.
     predictions : dict
         Cache of `holding_out.predicted`.
+    threads : int
+        Number of blocks that are matched at the same time; results do not depend on it.
     """
 
     def __init__(
@@ -45,7 +48,7 @@ class Scans:
         self.windows, self._parameters, self._stop = windows, parameters, stop
         first, resolution = windows.first, parameters.grid.resolution
         self.resolution = resolution
-        self.held_out = held_out
+        self.held_out, self.threads = held_out, parameters.search.threads or cores()
         self.predictions: dict[tuple[bytes, bytes, float], float] = {}
         self._explained: dict[bytes, tuple[float, Floats]] = {}
         sensors = compose(windows.robot, windows.mount)
@@ -103,7 +106,7 @@ class Scans:
         along = hashlib.sha256(nodes.tobytes()).digest()
         if along not in self._explained:
             which = self._readings_of(np.arange(len(self.windows)))
-            value, each = explained(self._placed(which, nodes, np.zeros(3)), self._parameters, self._stop)
+            value, each = explained(self._placed(which, nodes, np.zeros(3)), self._parameters, self._stop, self.threads)
             window = np.repeat(np.arange(len(self.windows)), np.diff(self.windows.first))[which]
             self._explained[along] = value, np.bincount(window, each, len(self.windows)).astype(np.float64)
         return self._explained[along]

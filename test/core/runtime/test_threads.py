@@ -191,6 +191,63 @@ def test_threads_end_with_the_owner_of_the_pool(fails: bool) -> None:
     assert len(begun) == 3 and not any(thread.is_alive() for thread in begun)
 
 
+def test_results_come_in_the_order_of_the_work_which_runs_in_parallel() -> None:
+    meeting = threading.Barrier(3, timeout=120)
+
+    def work(k: int) -> int:
+        # the first one ends last
+        meeting.wait()
+        time.sleep(0.02 * (3 - k % 3))
+        return k
+
+    results = threads.in_order([lambda k=k: work(k) for k in range(9)], 3)
+    assert list(results) == list(range(9))
+
+
+def test_work_of_one_thread_begins_when_its_result_is_asked_for() -> None:
+    begun: list[int] = []
+    results = threads.in_order([lambda k=k: begun.append(threading.get_ident()) for k in range(3)], 1)
+    assert not begun
+    next(results)
+    assert begun == [threading.get_ident()]
+
+
+def test_error_is_raised_in_the_place_of_its_result_and_no_more_work_begins() -> None:
+    begun: list[int] = []
+
+    def work(k: int) -> int:
+        begun.append(k)
+        if k == 2:
+            raise ValueError('of the work')
+        return k
+
+    results = threads.in_order([lambda k=k: work(k) for k in range(100)], 2)
+    assert [next(results), next(results)] == [0, 1]
+    with pytest.raises(ValueError, match='of the work'):
+        next(results)
+    assert max(begun) < 10
+
+
+def test_no_work_begins_once_results_are_no_longer_asked_for() -> None:
+    begun: list[int] = []
+    results = threads.in_order([lambda k=k: begun.append(k) for k in range(100)], 2)
+    next(results)
+    results.close()
+    count = len(begun)
+    assert count < 10
+    time.sleep(0.1)
+    assert len(begun) == count
+
+
+def test_work_in_order_runs_in_the_calling_thread_if_the_system_starts_none(monkeypatch: pytest.MonkeyPatch) -> None:
+    def start(thread: threading.Thread) -> None:
+        raise RuntimeError("can't start new thread")
+
+    monkeypatch.setattr(threading.Thread, 'start', start)
+    results = list(threads.in_order([threading.get_ident] * 5, 3))
+    assert results == [threading.get_ident()] * 5
+
+
 def test_number_of_cores_is_at_least_one() -> None:
     assert threads.cores() >= 1
 

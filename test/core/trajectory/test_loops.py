@@ -11,11 +11,12 @@ from exact_tour import quietly, tour_with
 from forward_grid_mapper.core.common.parameters import Parameters
 from forward_grid_mapper.core.common.readings import Floats
 from forward_grid_mapper.core.trajectory import loops
+from forward_grid_mapper.core.trajectory.holding_out import held_out_blocks, predicted
 from forward_grid_mapper.core.trajectory.local_map import for_matching
 from forward_grid_mapper.core.trajectory.loops import AROUND, LENGTH, Loop, Places, find_loop, find_loops, loops_of
 from forward_grid_mapper.core.trajectory.matching import Match
-from forward_grid_mapper.core.trajectory.passes import Matches, match_preceding
-from forward_grid_mapper.core.trajectory.pose_graph import residuals
+from forward_grid_mapper.core.trajectory.passes import Matches, match_preceding, match_surrounding
+from forward_grid_mapper.core.trajectory.pose_graph import Edges, residuals
 from forward_grid_mapper.core.trajectory.poses import compose, relative
 from forward_grid_mapper.core.trajectory.scans import Scans
 from forward_grid_mapper.core.trajectory.solving import Solver
@@ -54,6 +55,28 @@ def test_place_is_found_away_from_its_expected_pose(solver) -> None:
     across = [loop for loop in found if second[loop.block] != second[loop.place]]
     assert len(across) >= 3
     assert np.median(wrong_by(across, true)) < 0.15
+
+
+def test_matches_and_loops_do_not_depend_on_the_number_of_threads(solver, monkeypatch) -> None:
+    scans, nodes = solver._scans, solver._windows.node
+    samples = np.random.default_rng(0).standard_normal((40, len(nodes), 3)) * (0.1, 0.1, 0.01)
+    held = held_out_blocks(scans, 40)
+
+    def found(threads: int) -> tuple[list[Edges], list[Loop], Floats]:
+        monkeypatch.setattr(scans, 'threads', threads)
+        scans.predictions.clear()
+        matches = [match(scans, nodes, quietly) for match in (match_preceding, match_surrounding)]
+        loops = loops_of(find_loops(scans, nodes, samples, matches[0].mean_score, quietly))
+        edges = [each.edges() for each in (*matches, *(loop.matches for loop in loops))]
+        return edges, loops, predicted(scans, nodes, held)
+
+    (edges, one, alone), (others, three, together) = found(1), found(3)
+    assert len(edges) > 5 and np.isfinite(alone).sum() > 5
+    assert [(loop.block, loop.place) for loop in one] == [(loop.block, loop.place) for loop in three]
+    for edge, other in zip(edges, others, strict=True):
+        for column, same in zip(edge, other, strict=True):
+            np.testing.assert_array_equal(column, same)
+    np.testing.assert_array_equal(alone, together)
 
 
 def loop(true: Floats, block: int, place: int, off: float, sigma: float = 0.02) -> Loop:
@@ -103,9 +126,9 @@ def found_on_the_way_back(scans: Scans) -> list[Loop | None]:
     out, places = [], Places(scans, nodes)
     for middle in np.flatnonzero(~there & (nodes[:, 0] > 7.0) & (nodes[:, 0] < 13.0))[::6]:
         place = int(np.abs(nodes[there, 0] - nodes[middle, 0]).argmin())
-        block, around = np.arange(middle - LENGTH // 2, middle + LENGTH // 2), places[place]
-        assert around is not None
-        out.append(find_loop(scans, block, nodes, place, np.array([1.0, 0.2, math.radians(2.0)]), around, usual))
+        block = np.arange(middle - LENGTH // 2, middle + LENGTH // 2)
+        assert places[place] is not None
+        out.append(find_loop(scans, block, nodes, place, np.array([1.0, 0.2, math.radians(2.0)]), places, usual))
     assert len(out) >= 2
     return out
 
