@@ -301,6 +301,8 @@ class PoseAssociator(MessageAccount):
         assert self._history.newest is not None
         self._settle_up_to(self._history.newest)
         self.time_jumps += 1
+        # as after a reset between two drives: the poses that are forgotten are those of the drive before
+        self.jumps_before_begin += self.odometry_received == 1 and not len(self.buffer)
         for frame_id, count in Counter(
             m.frame_id for m in (*self._without_pose, *(measured for measured, _, _ in self._without_extrinsics))
         ).items():
