@@ -94,7 +94,8 @@ def _in_words(error: OSError) -> str:
         # without a buffer (PYTHONUNBUFFERED) the text is lost, and the next flush finds no error
         if error.errno == errno.ENOSPC:
             return f'standard output: {error.strerror}'
-    return str(error)
+        return str(error)
+    return f'{error.filename}: {error.strerror}'
 
 
 class Ticker:

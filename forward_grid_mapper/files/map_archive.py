@@ -89,5 +89,7 @@ def read_npz(path: Path | str) -> MapArchive:
             )
     except (FileNotFoundError, NotADirectoryError) as error:
         raise InputError(f'{path} does not exist; give a folder that process_bag or save_maps wrote') from error
+    except PermissionError as error:
+        raise InputError(f'{path} cannot be read: {error.strerror}') from error
     except Exception as error:  # zipfile, zlib and numpy have many kinds for damaged bytes
         raise InputError(f'{path} is not an archive of maps, or is damaged: {error}') from error

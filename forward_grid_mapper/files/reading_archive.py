@@ -77,6 +77,8 @@ def read_readings(path: Path | str, maps: MapArchive) -> ReadingArchive:
         raise InputError(
             f'{path} does not exist; make the maps again, without --workers and --scheduler, which write no readings'
         ) from error
+    except PermissionError as error:
+        raise InputError(f'{path} cannot be read: {error.strerror}') from error
     except Exception as error:  # zipfile, zlib and numpy have many kinds for damaged bytes
         raise InputError(f'{path} is not an archive of readings, or is damaged: {error}') from error
     if not sound:

@@ -89,7 +89,9 @@ class OdometryClock:
         return ['the stamps of odometry jump again and again: do two nodes publish odometry, or is a clock set?']
 
     def _counts(self) -> tuple[int, int]:
-        return self._associator.time_jumps, self._associator.odometry_rejected['ahead_of_others']
+        associator = self._associator
+        jumps = associator.time_jumps - associator.jumps_before_begin
+        return jumps, associator.odometry_rejected['ahead_of_others']
 
 
 class Arrivals:

@@ -126,7 +126,9 @@ class EmService:
                 waited = min(outcome.waited, spent)
                 compiled = f'after {waited:.0f} s of compiling kernels, as at the first start'
                 said = [summary(outcome.maps, spent - waited), compiled if waited >= LONG_WAIT else '']
-                warned = [f'WARNING: {warning}' for warning in outcome.warnings]
+                # the log and /diagnostics have named rejected readings before
+                warnings = [*outcome.warnings, *self._associator.rejection_warnings()]
+                warned = [f'WARNING: {warning}' for warning in warnings]
                 reply.send(True, '; '.join(filter(None, [*said, outcome.trajectory, *warned])))
 
         run = self.current

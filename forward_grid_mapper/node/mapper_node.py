@@ -19,7 +19,6 @@ from ..core.common.parameters import Parameters
 from ..core.common.words import counted
 from ..core.messages.message_types import NANOSECONDS
 from ..core.messages.pose_association import PoseAssociator
-from ..core.messages.rep117 import rejection_warnings, sensor_rejections
 from ..files.output_folder import unwritable
 from ..files.parameter_file import NODE_NAME
 from . import ros_parameters
@@ -397,10 +396,6 @@ class MapperNode(ManagedNode):
         """Return the state of the node for a report."""
         associator, node, name = self.associator, self.parameters.node, self.get_fully_qualified_name()
         self.feed.feed()
-        rejections = [
-            *rejection_warnings(associator.rejected, associator.received),
-            *sensor_rejections(associator.rejected_by_frame, associator.buffer.counts()),
-        ]
         source = {
             'node': name,
             'range_topics': list(self.em.range_topics),
@@ -422,7 +417,7 @@ class MapperNode(ManagedNode):
                 *self.intake.repeated(),
                 *self.intake.clock_notes(),
                 *self.em.drive_faults,
-                *rejections,
+                *associator.rejection_warnings(),
             ],
         }
         path, odometry = list(associator.path), associator.odometry

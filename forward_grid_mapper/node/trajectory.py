@@ -130,8 +130,8 @@ class Trajectory:
 
     @property
     def _jumped_back(self) -> bool:
-        """Whether the clock jumped back, and no run has found a trajectory since then."""
-        return self._associator.time_jumps > self._jumps_explained
+        """Whether the clock jumped back in this drive, and no run has found a trajectory since then."""
+        return self._associator.time_jumps > max(self._jumps_explained, self._associator.jumps_before_begin)
 
     @property
     def place(self) -> Callable[[Readings], Readings] | None:

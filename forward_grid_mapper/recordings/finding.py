@@ -58,10 +58,8 @@ def find_recordings(words: Sequence[Path | str]) -> Recordings:
 def _bags_of(path: Path) -> Recordings:
     """Return the bags in a folder that is not a bag itself; none if `path` is anything else."""
     nothing = Recordings([], [])
-    if not path.is_dir() or (path / 'metadata.yaml').is_file():
-        return nothing
     try:
-        if drive_file(path) is not None:
+        if not path.is_dir() or (path / 'metadata.yaml').is_file() or drive_file(path) is not None:
             return nothing
         inside = sorted(path.iterdir(), key=lambda entry: natural_order(entry.name))
         files = _files_in(path)
@@ -90,7 +88,9 @@ def _is_bag(folder: Path) -> bool:
 
 
 def _is_one(files: Sequence[Path]) -> bool:
-    """Return whether files belong to the same bag, by their names."""
+    """Return whether files belong to the same bag, by their names; each file of ROS 1 can be read by itself."""
+    if len(files) > 1 and any(file.suffix == '.bag' for file in files):
+        return False
     return len({_PART.sub('', Path(plain_name(file)).stem) for file in files}) == 1
 
 

@@ -211,7 +211,7 @@ def test_name_is_kept_in_an_ascii_locale(tmp_path: Path, bag: Path) -> None:
     ('error', 'code', 'expected'),
     [
         (MemoryError(), 1, 'raise resolution'),
-        (FileNotFoundError(2, 'No such file or directory', 'there'), 1, "'there'"),
+        (FileNotFoundError(2, 'No such file or directory', 'there'), 1, 'error: there: No such file or directory'),
         (KeyboardInterrupt(), 130, 'nothing was written'),
     ],
 )

@@ -161,6 +161,22 @@ def test_folder_without_maps_or_readings_is_rejected(
         assert reason in capsys.readouterr().err
 
 
+@pytest.mark.parametrize('name', ['maps.npz', 'readings.npz'])
+def test_file_without_read_permission_is_not_called_damaged(
+    maps: Path, name: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    whole = Path.open
+
+    def refuse(path: Path, *args: Any, **options: Any) -> Any:
+        if path.name == name:
+            raise PermissionError(13, 'Permission denied', str(path))
+        return whole(path, *args, **options)
+
+    monkeypatch.setattr(Path, 'open', refuse)
+    assert explain.main([str(maps), '0', '0']) == 1
+    assert capsys.readouterr().err == f'explain: error: {maps / name} cannot be read: Permission denied\n'
+
+
 @pytest.mark.parametrize('resolution', [0.05, 0.1, 0.2])
 def test_position_on_the_edge_of_the_map(resolution: float) -> None:
     nothing = np.zeros((3, 27))

@@ -456,6 +456,16 @@ def test_wrong_stamps_of_sensors_are_named_in_the_response(robot: EmRobot) -> No
     assert 'WARNING: the stamps of sonar are 2.5 s behind' in answer.sent[0][1]
 
 
+def test_rejected_readings_are_named_in_the_response(robot: EmRobot) -> None:
+    robot.associator.received = 100
+    robot.associator.rejected['pose_jump'] = 90
+    answer = robot.run_em()
+    robot.settle()
+    assert 'WARNING: 90 of 100 readings were rejected as pose_jump' in answer.sent[0][1]
+    # diagnostics have those of the last seconds
+    assert not robot.em.wrong_input
+
+
 def test_consistency_is_checked_again_when_the_readings_have_doubled(robot: EmRobot) -> None:
     robot.contradictions = ['stamps are late']
 

@@ -267,6 +267,17 @@ def test_jump_back_of_time_gives_a_warning() -> None:
     assert robot.account() == (2, 1, 0, 1)
 
 
+def test_jump_back_with_which_a_drive_begins_gives_no_warning() -> None:
+    robot = Taking()
+    robot.intake.begin()
+    robot.odometry(100.0)
+    # as the service reset does
+    robot.associator.clear()
+    robot.intake.forget()
+    robot.odometry(50.0)
+    assert robot.node.warned == [] and robot.associator.time_jumps == 1
+
+
 def test_odometry_that_waited_for_a_transform_is_in_order(monkeypatch: pytest.MonkeyPatch) -> None:
     """It comes before other waiting messages."""
     robot = Taking()

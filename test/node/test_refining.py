@@ -465,6 +465,21 @@ def test_jump_back_of_the_clock_gives_a_warning_until_reset(inside: Callable[...
     assert robot.status('trajectory')['level'] == OK
 
 
+def test_second_drive_after_a_reset_may_have_earlier_stamps(inside: Callable[..., Inside], quick: Any) -> None:
+    """As when another bag is played: nothing of the second drive is lost, and a second reset would lose it."""
+    robot, _ = refined(inside(refine_poses=True).start())
+    robot.call(robot.node.reset)
+    quick.accepts = False
+    for k in range(60):
+        robot.odometry(20.0 + 0.05 * k, k / 75.0)
+        robot.range(20.0 + 0.05 * k)
+    robot.until(lambda: not robot.node.intake.busy)
+    assert robot.call(robot.node.em.run_em)[0]
+    status = robot.status('trajectory')
+    assert status['level'] == OK and 'jumped back' not in status['message']
+    assert robot.node.trajectory.distance.jump is None
+
+
 def test_clock_that_is_behind_the_journal_has_jumped_back(
     inside: Callable[..., Inside], quick: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
+import errno
+import os
 from pathlib import Path
+
+import pytest
 
 from forward_grid_mapper.recordings.finding import find_recordings
 
@@ -50,6 +54,20 @@ def test_single_bag_is_no_folder_of_bags(tmp_path: Path) -> None:
     # files of a split bag are not several drives, even with other bags beside them
     folder = made(tmp_path / 'split', 'a_0.mcap', 'a_1.mcap', 'b/metadata.yaml')
     assert names_of(folder) == ['.']
+
+
+def test_files_of_ros_1_are_bags_of_their_own(tmp_path: Path) -> None:
+    # `rosbag record --split`, and `simulate campus --format ros1`, number their files
+    folder = made(tmp_path, 'drive_0000.bag', 'drive_0001.bag')
+    assert names_of(folder) == ['drive_0000.bag', 'drive_0001.bag']
+
+
+def test_folder_without_permission_is_left_to_the_reader(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def refused(path: Path) -> bool:
+        raise PermissionError(errno.EACCES, os.strerror(errno.EACCES), str(path))
+
+    monkeypatch.setattr(Path, 'is_file', refused)
+    assert find_recordings([tmp_path]) == ([tmp_path], [])
 
 
 def test_names_with_superscript_digits_are_sorted(tmp_path: Path) -> None:

@@ -26,10 +26,12 @@ class MessageAccount:
         Sensor frames whose pose on the robot is unknown at present.
     time_jumps : int
         Number of times that the clock of odometry jumped back.
+    jumps_before_begin : int
+        Those of them, at most one, with which the drive begins: nothing of it was lost.
     """
 
     def __init__(self) -> None:
-        self.received = self.odometry_received = self.time_jumps = 0
+        self.received = self.odometry_received = self.time_jumps = self.jumps_before_begin = 0
         self.rejected: Counter[str] = Counter()
         self.odometry_rejected: Counter[str] = Counter()
         self.rejected_by_frame: dict[str, Counter[str]] = {}
@@ -37,7 +39,7 @@ class MessageAccount:
 
     def begin_account(self) -> None:
         """Begin to count anew."""
-        self.received = self.odometry_received = self.time_jumps = 0
+        self.received = self.odometry_received = self.time_jumps = self.jumps_before_begin = 0
         self.rejected.clear()
         self.odometry_rejected.clear()
         self.rejected_by_frame.clear()

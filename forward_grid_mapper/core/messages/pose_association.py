@@ -26,7 +26,7 @@ from .message_types import NANOSECONDS, OdometryMessage, Pose2, RangeMessage
 from .missing_readings import MissingReadings
 from .pose_history import PoseHistory
 from .reading_buffer import ReadingBuffer
-from .rep117 import LONGEST_NAME, Measurement, measure
+from .rep117 import LONGEST_NAME, Measurement, measure, rejection_warnings, sensor_rejections
 from .robot_path import RobotPath
 from .stamp_order import JUMP, JUMPED_BACK, WAS_AHEAD, order_of
 
@@ -164,6 +164,13 @@ class PoseAssociator(MessageAccount):
         """Return warnings about the Range messages so far; empty if there is no suspicion."""
         return [*self.limits.warnings(), *self.missing.warnings()]
 
+    def rejection_warnings(self) -> list[str]:
+        """Return warnings about the readings that were rejected so far; empty if they are few."""
+        return [
+            *rejection_warnings(self.rejected, self.received),
+            *sensor_rejections(self.rejected_by_frame, self.buffer.counts()),
+        ]
+
     def add_range(self, message: RangeMessage, sent: int = 0) -> None:
         """Take one Range message; `sent` is when it was published, nanoseconds of the system's clock, 0 if unknown."""
         self.received += 1
@@ -294,6 +301,8 @@ class PoseAssociator(MessageAccount):
         assert self._history.newest is not None
         self._settle_up_to(self._history.newest)
         self.time_jumps += 1
+        # as after a reset between two drives: the poses that are forgotten are those of the drive before
+        self.jumps_before_begin += self.odometry_received == 1 and not len(self.buffer)
         for frame_id, count in Counter(
             m.frame_id for m in (*self._without_pose, *(measured for measured, _, _ in self._without_extrinsics))
         ).items():

@@ -553,6 +553,21 @@ def test_clock_behind_restored_readings_is_no_jump_after_a_reset() -> None:
     assert p.time_jumps == 0
 
 
+@pytest.mark.parametrize('reset', [True, False])
+def test_jump_back_with_which_a_drive_begins_loses_nothing_of_it(reset: bool) -> None:
+    p = associator()
+    p.add_odometry(odometry(10.0))
+    p.add_range(sonar(10.0))
+    if reset:
+        p.clear()
+    for second in (1.0, 1.1):
+        p.add_odometry(odometry(second))
+    p.add_range(sonar(1.0))
+    assert (p.time_jumps, p.jumps_before_begin, len(p.buffer)) == (1, int(reset), 2 - reset)
+    p.add_odometry(odometry(0.0))
+    assert (p.time_jumps, p.jumps_before_begin) == (2, int(reset))
+
+
 def test_clock_set_ahead_and_back_is_one_jump() -> None:
     p = associator()
     for second in (10.0, 10.1, 70.2, 70.3, 10.4, 10.5):
