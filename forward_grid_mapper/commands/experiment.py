@@ -73,9 +73,10 @@ def experiment(options: argparse.Namespace) -> int:
         with output_errors(folder):
             (folder / 'table.txt').write_text(table + '\n', encoding='utf-8')
     print(table)
-    print(f'\ntable and figure are in {output}')
+    figures = sorted(output.glob('figure*.png'))
+    print(f'\ntable and figure{"s" * (len(figures) > 1)} are in {output}')
     if options.show:
-        show(min(output.glob('figure*.png')))
+        show(figures[0])
     return 0
 
 

@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ..core.common.grid import Grid
+from ..core.common.grid import UNKNOWN, Grid
 from ..core.common.parameters import Parameters
 from ..core.common.readings import Floats, Readings
 from ..core.common.words import counted
@@ -148,11 +148,18 @@ def one(exact: Recording, seed: int, parameters: Parameters) -> tuple[Figure, di
         tiles.append(FigureTile(title, maps.grid, maps.ml, path_xy=ways[kind]))
     tiles[2] = tiles[2]._replace(odometry_xy=ways['odometry'])
     truth = FigureTile('truth', world.grid, world.reference, path_xy=ways['true'])
-    view = box_of([*ways.values()], world.grid.extent)
+    view = box_of([*ways.values(), *map(known_corners, tiles)], world.grid.extent)
     # the layout of figures: wide maps are stacked
     wide = (view[1] - view[0]) > WIDE * (view[3] - view[2])
     shown = [truth, *tiles]
     return ([[tile] for tile in shown] if wide else [shown[:2], shown[2:]], view), rows, outcome.accepted
+
+
+def known_corners(tile: FigureTile) -> NDArray[np.float64]:
+    """Return two opposite corners of the known part of a map, shape (2, 2), metres."""
+    x, y = tile.grid.centers()
+    row, column = np.nonzero(tile.values != UNKNOWN)
+    return np.array([[x[column.min()], y[row.min()]], [x[column.max()], y[row.max()]]])
 
 
 def box_of(ways: Sequence[NDArray[np.float64]], extent: Box) -> Box:

@@ -81,10 +81,11 @@ def _files_in(folder: Path) -> list[Path]:
 
 
 def _is_bag(folder: Path) -> bool:
-    """Return whether a folder is a bag, with or without metadata."""
-    if (folder / 'metadata.yaml').is_file():
+    """Return whether a folder is a bag, with or without metadata; if it cannot be read, the reader of bags says so."""
+    try:
+        return (folder / 'metadata.yaml').is_file() or _is_one(_files_in(folder))
+    except PermissionError:
         return True
-    return _is_one(_files_in(folder))
 
 
 def _is_one(files: Sequence[Path]) -> bool:

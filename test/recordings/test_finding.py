@@ -8,6 +8,7 @@ from pathlib import Path
 
 import pytest
 
+from forward_grid_mapper.recordings import finding
 from forward_grid_mapper.recordings.finding import find_recordings
 
 
@@ -45,6 +46,19 @@ def test_entries_left_out_are_named(tmp_path: Path) -> None:
     assert names_of(folder) == ['a']
     (message,) = find_recordings([folder]).skipped
     assert ': journal, robots, week, night.bag.active; if they are recordings' in message
+
+
+def test_folder_without_permission_is_among_the_bags_beside_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    folder = made(tmp_path, 'a/metadata.yaml', 'b/b_0.mcap')
+    whole = finding.storage_files
+
+    def refused(inside: Path) -> list[Path]:
+        if inside.name == 'b':
+            raise PermissionError(13, 'Permission denied', str(inside))
+        return whole(inside)
+
+    monkeypatch.setattr(finding, 'storage_files', refused)
+    assert names_of(folder) == ['a', 'b']
 
 
 def test_single_bag_is_no_folder_of_bags(tmp_path: Path) -> None:

@@ -170,7 +170,8 @@ class Page {
     }
     box.append(groups);
     if (!readings.length) return;
-    const body = make('tbody'), largest = Math.abs(readings[0].nats);
+    // a bar of full length is at least a tenth of a nat
+    const body = make('tbody'), largest = Math.max(Math.abs(readings[0].nats), 0.1);
     for (const r of readings.slice(0, most)) {
       const bar = make('span', {className: r.nats > 0 ? 'bar for' : 'bar against'});
       bar.style.width = `${Math.max(40 * Math.abs(r.nats) / largest, 1)}px`;
