@@ -123,6 +123,9 @@ def candidates(
         Places where it was recognised already.
     """
     places = np.arange(0, len(nodes), SHARED)
+    # farther ones are impossible, and a long drive has thousands of them
+    far = np.hypot(*(nodes[places, :2] - nodes[middle, :2]).T)
+    places = places[(np.abs(progress[places] - progress[middle]) > APART) & (far < REACH + LARGEST[0])]
     there = nodes[places] + samples[:, places]
     drawn = relative(there, (nodes[middle] + samples[:, middle])[:, None])
     mean = relative(nodes[places], nodes[middle])
@@ -131,8 +134,7 @@ def candidates(
     sigma = np.sqrt((off**2).mean(0))
     far = np.hypot(mean[:, 0], mean[:, 1])
     wide = np.hypot(sigma[:, 0], sigma[:, 1])
-    away = np.abs(progress[places] - progress[middle])
-    possible = (away > APART) & (far < REACH + np.minimum(wide, LARGEST[0]))
+    possible = far < REACH + np.minimum(wide, LARGEST[0])
     out: list[tuple[int, Floats]] = []
     for k in np.argsort(np.where(possible, far + wide, np.inf))[: possible.sum()]:
         node = int(places[k])
