@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import numpy as np
 import pytest
 
@@ -31,6 +33,13 @@ def test_each_reading_is_held_out_once_together_with_its_block() -> None:
     blocks = (READINGS.stamp - READINGS.stamp.min()) // 2_000_000_000
     for block in np.unique(blocks):
         assert len(set(fold[blocks == block].tolist())) == 1
+
+
+def test_drive_with_pauses_has_all_folds() -> None:
+    """Readings of 2 s, ten times, with pauses of 8 s."""
+    stamp = READINGS.stamp.min() + np.arange(1000) // 100 * 10_000_000_000 + np.arange(1000) % 100 * 19_000_000
+    fold = folds_of(dataclasses.replace(READINGS.select(slice(1000)), stamp=stamp))
+    assert np.bincount(fold).tolist() == [200] * FOLDS
 
 
 def test_held_out_readings_are_not_used_in_learning(monkeypatch: pytest.MonkeyPatch) -> None:
