@@ -69,7 +69,7 @@ def cross_validated(
         watch(f'held-out readings, {k + 1} of {FOLDS}', None)
         rest, held = readings.select(fold != k), readings.select(fold == k)
         first = Mapper(parameters).run(rest)
-        learned = learn_jointly(rest, parameters, rounds, keep_going=True).maps
+        learned = learn_jointly(rest, parameters, rounds, keep_going=True, first=first).maps
         for i, maps in enumerate((first, learned)):
             for j, values in enumerate((parameters.model, learned.parameters.model)):
                 log_likelihood[i, j, fold == k] = log_likelihoods(held, maps, values)

@@ -54,6 +54,14 @@ def test_held_out_readings_are_not_used_in_learning(monkeypatch: pytest.MonkeyPa
         judged.append(set(held.stamp.tolist()))
         return np.zeros(len(held))
 
+    made: list[tuple[int, object]] = []
+    run = Mapper.run
+
+    def map_of(self: Mapper, readings: Readings, *args: object, **options: object) -> object:
+        made.append((int(readings.stamp.sum()), self._parameters))
+        return run(self, readings, *args, **options)  # type: ignore[arg-type]
+
+    monkeypatch.setattr(Mapper, 'run', map_of)
     monkeypatch.setattr(module, 'learn_jointly', learn)
     monkeypatch.setattr(module, 'log_likelihoods', judge)
     assert cross_validated(READINGS, Parameters(), 1) == CrossValidation(0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
@@ -61,6 +69,7 @@ def test_held_out_readings_are_not_used_in_learning(monkeypatch: pytest.MonkeyPa
     for k, stamps in enumerate(learned_from):
         assert all(not stamps & held for held in judged[4 * k : 4 * k + 4])
     assert set().union(*judged) == set(READINGS.stamp.tolist())
+    assert len(made) == len(set(made)) == 2 * FOLDS, 'a map is made twice'
 
 
 def test_likelihood_does_not_depend_on_the_grid() -> None:
