@@ -47,8 +47,12 @@ def stamps(name: str, values: ArrayLike, length: int | None = None) -> NDArray[n
     if given.dtype.kind in 'mM':
         return _shaped(name, _nanoseconds(name, given), length)
     seconds = column(name, values, length)
-    if not np.isfinite(seconds).all() or (np.abs(seconds) > _LARGEST).any():
-        raise InputError(f'{name} must be seconds, all finite; nanoseconds must be divided by 1e9')
+    if unknown := int(np.count_nonzero(~np.isfinite(seconds))):
+        raise InputError(f'{name} has {unknown} stamps that are not finite; {LEAVE_OUT}')
+    if (np.abs(seconds) > _LARGEST).any():
+        raise InputError(
+            f'{name} must be seconds: milliseconds must be divided by 1e3, microseconds by 1e6, nanoseconds by 1e9'
+        )
     if given.dtype.kind == 'f' and len(seconds):
         step = float(np.spacing(np.abs(given).max()))
         if step > COARSEST:

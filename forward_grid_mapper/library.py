@@ -18,8 +18,8 @@ from .core.common.words import counted
 from .core.mapping import Mapper, Watch
 from .core.maps.map_set import MapSet
 from .core.messages.extrinsics import Mount
-from .core.messages.message_types import Pose2, RangeMessage
-from .core.messages.mounts import FARTHEST_MOUNT, TURN
+from .core.messages.message_types import NANOSECONDS, OdometryMessage, Pose2, RangeMessage
+from .core.messages.mounts import FARTHEST_MOUNT, more_than_a_turn
 from .core.messages.pose_association import PoseAssociator
 from .core.messages.rep117 import ODOMETRY_REASONS, REASONS, rejection_warnings, sensor_rejections
 from .files.pose_files import poses_from_csv, poses_from_tum
@@ -62,7 +62,9 @@ class Sonar:
             self.field_of_view / 1.0
         except (TypeError, OverflowError) as error:
             raise InputError(f'{self}: not a number: {error}') from None
-        if abs(self.yaw) > TURN:
+        if not finite:
+            raise InputError(f'{self}: pose and limits must be finite')
+        if more_than_a_turn(self.yaw):
             raise InputError(f'yaw = {self.yaw:g} rad is more than a full turn; did you mean radians({self.yaw:g})?')
         if math.hypot(self.x, self.y) > FARTHEST_MOUNT:
             raise InputError(
@@ -73,8 +75,6 @@ class Sonar:
             raise InputError(
                 f'pitch = {self.pitch:g} rad is beyond straight down; did you mean radians({self.pitch:g})?'
             )
-        if not finite:
-            raise InputError(f'{self}: pose and limits must be finite')
         if not 0.0 < self.field_of_view < math.pi:
             degrees = f'; did you mean radians({self.field_of_view:g})?' if 4 < self.field_of_view < 180 else ''
             raise InputError(f'field_of_view = {self.field_of_view:g} is not an angle between 0 and pi rad{degrees}')
@@ -180,9 +180,11 @@ def make_maps(
         sensor_of = np.asarray(sensor_of).tolist()
         if not isinstance(sensor_of, (str, list)):
             raise InputError('sensor_of must be the name of a sensor, or one name for each range')
+    if of_sensors := [name for name in parameters or {} if name.partition('.')[0] in ('sensors', 'sensor')]:
+        raise InputError(f'{of_sensors[0]} is no parameter here: give poses of sensors in `sensors`')
     chosen = Parameters.from_flat(parameters or {})
-    odometry = arrays.poses_of(arrays.stamps('pose_stamps', pose_stamps), poses)
-    stamps = arrays.stamps('range_stamps', range_stamps)
+    odometry = arrays.poses_of(_set(arrays.stamps('pose_stamps', pose_stamps)), poses)
+    stamps = _set(arrays.stamps('range_stamps', range_stamps))
     values = arrays.column('ranges', ranges, len(stamps))
     names = [sensor_of] * len(values) if isinstance(sensor_of, str) else [str(name) for name in sensor_of]
     if len(names) != len(values):
@@ -208,6 +210,7 @@ def make_maps(
         reasons = '; '.join(f'{n} {reason} ({REASONS[reason]})' for reason, n in associator.rejected.most_common())
         reasons += ''.join(f'; {text}' for text in _pose_warnings(associator))
         spans = f'poses span {odometry[0].stamp / 1e9:.3f} … {odometry[-1].stamp / 1e9:.3f} s'
+        reasons += _unit_of_stamps(odometry, chosen)
         raise InputError(
             f'none of {len(values)} ranges could be used: {reasons}; {spans}, ranges '
             f'{stamps.min() / 1e9:.3f} … {stamps.max() / 1e9:.3f} s'
@@ -229,6 +232,19 @@ def make_maps(
     counts = {'received': len(values), 'accepted': len(associator.buffer), 'rejected': rejected}
     source = {'counts': counts, 'warnings': before, 'extrinsics': mounted}
     return SonarMaps(maps, len(values), rejected, (*before, *judged), path, source, judged)
+
+
+def _set(stamps: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Return stamps without 0, which is no stamp in a message: a nanosecond later."""
+    return np.where(stamps == 0, 1, stamps)
+
+
+def _unit_of_stamps(odometry: Sequence[OdometryMessage], parameters: Parameters) -> str:
+    """Return a hint, after a semicolon, if poses are so far apart that stamps may have another unit; otherwise ''."""
+    apart = np.median(np.diff([pose.stamp for pose in odometry])) / NANOSECONDS if len(odometry) > 1 else 0.0
+    if apart <= parameters.association.max_pose_gap:
+        return ''
+    return f'; poses are {apart:g} s apart: are the stamps in milliseconds? They must be in seconds'
 
 
 def _of_the_node(parameters: Parameters) -> list[str]:

@@ -17,6 +17,7 @@ from forward_grid_mapper import Sonar, SonarMaps, arrays, library, make_maps, po
 from forward_grid_mapper.core.common.errors import InputError, OutputError, ParameterError
 from forward_grid_mapper.core.common.parameters import Parameters
 from forward_grid_mapper.core.mapping import Mapper
+from forward_grid_mapper.files.parameter_file import parse_sensor
 from forward_grid_mapper.simulation.drive import door_drive
 from forward_grid_mapper.simulation.sonar import NOISY, front_array
 from samples import associated
@@ -193,6 +194,8 @@ def test_parameters_may_be_numpy_scalars() -> None:
             'float32, in which numbers of this size are 128 s apart',
         ),
         ({'range_stamps': np.array([3.0, 40.0], np.float16)}, 'float16, in which numbers'),
+        ({'range_stamps': [1.0, math.nan, math.inf]}, 'range_stamps has 2 stamps that are not finite; leave them out'),
+        ({'parameters': {'sensors.f.pose': [0, 0, 0]}}, 'sensors.f.pose is no parameter here: give poses of sensors'),
         ({'range_stamps': np.array(['NaT'], 'M8[ns]')}, 'range_stamps has 1 times that are NaT'),
         ({'range_stamps': np.array([5], 'm8')}, 'range_stamps has the type timedelta64, which is not a type of stamps'),
         ({'range_stamps': np.array(['9999-01-01'], 'M8[D]')}, 'which is not a type of stamps'),
@@ -240,7 +243,7 @@ def test_parameters_of_the_node_give_a_warning() -> None:
 
 def test_values_in_wrong_units_are_rejected() -> None:
     arrays = given()
-    with pytest.raises(InputError, match='must be divided by 1e9'):
+    with pytest.raises(InputError, match='nanoseconds by 1e9'):
         make_maps(**{**arrays, 'range_stamps': np.array(arrays['range_stamps']) * 1e9 + 1.7e18})
     with pytest.raises(InputError, match=re.escape('did you mean radians(30)?')):
         Sonar(0.0, 0.0, 0.0, 30.0, 3.0)
@@ -256,6 +259,8 @@ def test_values_in_wrong_units_are_rejected() -> None:
         Sonar(0.0, 0.0, 0.0, 0.5, 3.0, 4.0)
     with pytest.raises(InputError, match='must be finite'):
         Sonar(0.0, math.nan, 0.0, 0.5, 3.0)
+    with pytest.raises(InputError, match='must be finite'):
+        Sonar(0.0, 0.0, math.inf, 0.5, 3.0)
     poses = np.array(arrays['poses'])
     poses[3, 2] = math.nan
     with pytest.raises(InputError, match='1 poses are not finite'):
@@ -269,6 +274,29 @@ def test_stamps_that_do_not_overlap_are_reported() -> None:
     late = np.array(arrays['range_stamps']) + 1e6
     with pytest.raises(InputError, match=r'none of .* after_odometry .*poses span'):
         make_maps(**{**arrays, 'range_stamps': late})
+
+
+def test_stamps_in_milliseconds_are_reported() -> None:
+    arrays = given()
+    kinds, begin = ('pose_stamps', 'range_stamps'), arrays['pose_stamps'][0]
+    stamps = {kind: np.round(1e3 * (np.array(arrays[kind]) - begin)).astype(int) for kind in kinds}
+    with pytest.raises(InputError, match=r'poses are \d+ s apart: are the stamps in milliseconds\?'):
+        make_maps(**{**arrays, **stamps, 'range_stamps': stamps['range_stamps'] + 1})
+
+
+def test_clock_may_begin_at_zero() -> None:
+    """In a message the stamp 0 means that there is none."""
+    poses, stamps = np.array([[0.1 * k, 0.0, 0.0] for k in range(30)]), 0.1 * np.arange(30)
+    sonar = {'a': Sonar(0.0, 0.0, 0.0, 0.3, 3.0)}
+    late = make_maps(stamps, poses, stamps[:20], np.full(20, 2.0), sonar, 'a', {'range_time_offset': 0.05})
+    assert late.maps.readings.x == pytest.approx(0.05 + 0.1 * np.arange(20), abs=1e-6)
+    before = make_maps(stamps[5:], poses[5:], stamps, np.full(30, 2.0), sonar, 'a')
+    assert before.rejected == {'before_odometry': 5}
+
+
+def test_yaw_of_a_sensor_may_be_a_full_turn_of_float32() -> None:
+    assert Sonar(0.0, 0.0, float(np.float32(2 * math.pi)), 0.3, 3.0).yaw > 2 * math.pi
+    assert parse_sensor('a=0,0,6.2831855')[1].yaw > 2 * math.pi
 
 
 def test_tum_trajectory_is_read(tmp_path: Path) -> None:

@@ -23,7 +23,17 @@ TRANSFORM_TOLERANCE = 1e-6
 
 
 class SteepSensorError(InputError):
-    """The sensor's axis is too steep for a planar map."""
+    """The sensor's axis is too steep for a planar map; `side` is where it looks, up or down."""
+
+    def __init__(self, frames: Sequence[str], side: str, base_frame: str) -> None:
+        one = len(frames) == 1
+        super().__init__(
+            f'{"Sensor" if one else "Sensors"} {", ".join(map(repr, frames))} {"looks" if one else "look"} {side}, '
+            f'more than {math.degrees(STEEPEST):.0f}° out of the plane of {base_frame!r}; fix '
+            f'{"its transform" if one else "their transforms"} (the x axis is the direction of the beam), or leave out '
+            f'{"the sensor" if one else "the sensors"}.'
+        )
+        self.side = side
 
 
 class StaticTransforms:
@@ -160,12 +170,7 @@ class StaticTransforms:
         pose = np.linalg.inv(to_base[common]) @ to_sensor[common]
         mount = mount_of(float(pose[0, 3]), float(pose[1, 3]), pose[:3, 0].tolist())
         if isinstance(mount, str):
-            side = 'up' if pose[2, 0] > 0 else 'down'
-            raise SteepSensorError(
-                f'Sensor {sensor_frame!r} looks {side}, more than {math.degrees(STEEPEST):.0f}° out of the plane of '
-                f'{base_frame!r}; fix its transform (the x axis is the direction of the beam), or leave out the '
-                'sensor.'
-            )
+            raise SteepSensorError([sensor_frame], 'up' if pose[2, 0] > 0 else 'down', base_frame)
         return mount
 
     def _ancestors(self, frame: str) -> dict[str, Transform]:

@@ -35,8 +35,8 @@ FOLDS = 5
 
 
 def folds_of(readings: Readings) -> NDArray[np.int64]:
-    """Return the fold in which each reading is held out, shape (N,)."""
-    return blocks_of(readings) % FOLDS
+    """Return the fold in which each reading is held out, shape (N,); pauses of the drive do not count."""
+    return np.unique(blocks_of(readings), return_inverse=True)[1].ravel() % FOLDS
 
 
 def blocks_of(readings: Readings) -> NDArray[np.int64]:
@@ -69,7 +69,7 @@ def cross_validated(
         watch(f'held-out readings, {k + 1} of {FOLDS}', None)
         rest, held = readings.select(fold != k), readings.select(fold == k)
         first = Mapper(parameters).run(rest)
-        learned = learn_jointly(rest, parameters, rounds, keep_going=True).maps
+        learned = learn_jointly(rest, parameters, rounds, keep_going=True, first=first).maps
         for i, maps in enumerate((first, learned)):
             for j, values in enumerate((parameters.model, learned.parameters.model)):
                 log_likelihood[i, j, fold == k] = log_likelihoods(held, maps, values)
@@ -115,7 +115,9 @@ def only_if_validated(
         return found
     validation = cross_validated(readings, parameters, rounds, watch)
     if validation is None:
-        short = f'the drive is shorter than {FOLDS * BLOCK:.0f} s: no readings could be held out to test the values'
+        short = (
+            f'there are readings of less than {FOLDS * BLOCK:.0f} s: no readings could be held out to test the values'
+        )
         return dataclasses.replace(found, warnings=(*found.warnings, short))
     if validation.better:
         return dataclasses.replace(found, cross_validation=validation)

@@ -197,6 +197,7 @@ def learn_jointly(
     rounds: int = 5,
     keep_going: bool = False,
     watch: Watch = lambda stage, progress: None,
+    first: MapSet | None = None,
 ) -> Learned:
     """Learn p_hit, p_rand, p_lost and σ together with the map.
 
@@ -211,13 +212,15 @@ def learn_jointly(
         Whether to accept values even if their map loses walls.
     watch : callable
         Receives stages and progress, as in `Mapper.run`.
+    first : MapSet, optional
+        The maps of the initial values, if they were made already.
 
     Raises
     ------
     InputError
         If there are no readings, or they span too large a map.
     """
-    first = last = Mapper(parameters).run(readings, watch)
+    first = last = first or Mapper(parameters).run(readings, watch)
     accepted, history = [first], [_round(first, first, None)]
     learned_from = first
     converged = False

@@ -10,7 +10,7 @@ import yaml
 
 from ..core.common.errors import ParameterError
 from ..core.common.parameter import LARGEST_NUMBER
-from ..core.trajectory.certainty import Estimate
+from ..core.trajectory.certainty import CalibrationEstimate
 from .small_text import read_text
 
 FILE_KEYS = {
@@ -34,7 +34,7 @@ HOW_TO_APPLY = {
 }
 
 
-def calibration_text(estimates: Mapping[str, Estimate], drive: str) -> str:
+def calibration_text(estimates: Mapping[str, CalibrationEstimate], drive: str) -> str:
     """Return the file of a calibration, with the names of `core.trajectory.odometry_model`; '' without values."""
     if not estimates:
         return ''

@@ -2,7 +2,8 @@
 
 A journal file is an SQLite database in WAL mode:
 
-    drive      row 0: map_frame and base_frame (UTF-8), and the parameters of the node that wrote it (JSON);
+    drive      row 0: map_frame and base_frame (UTF-8), and the parameters of the node that wrote it (JSON), among them
+               `MOUNTS`, the poses of the sensors on the robot by frame, [x, y, yaw];
                row 1, if the file continues an earlier one: the name of that file
     sensors    number of a sensor, and its frame_id in UTF-8
     path       points of the robot's path in the map frame: x, y (float64)
@@ -34,7 +35,7 @@ from ..core.common.errors import ParameterError
 from ..core.common.parameters import TABLE, Parameters
 from ..core.common.readings import Readings
 from ..core.messages.map_extent import LARGEST_COORDINATE
-from ..core.messages.message_types import NANOSECONDS
+from ..core.messages.message_types import NANOSECONDS, Pose2
 
 DRIVE = re.compile(r'drive_(\d{4,})\.journal')
 """Name of a journal file."""
@@ -86,6 +87,9 @@ MOST_POINTS = 200_000
 
 LATEST = (1 << 32) * NANOSECONDS
 """Largest absolute value of a stamp, nanoseconds: that of 32 bits of seconds, so that differences fit into 64 bits."""
+
+MOUNTS = 'sensors'
+"""Key of the poses of sensors among the parameters of the node; no parameter has this name."""
 
 Insert = tuple[str, tuple[Any, ...]]
 """A table, and the values of a row."""
@@ -139,6 +143,8 @@ class Contents:
     map_frame, base_frame : str
     parameters : dict
         Those of the node that wrote the file which are not the defaults.
+    mounts : dict of str → Pose2
+        Poses of the sensors on the robot when their latest readings were placed, by frame, as far as they are fixed.
     sensors : dict of int → str
         Names by number.
     path : list of (x, y)
@@ -162,6 +168,7 @@ class Contents:
     map_frame: str = ''
     base_frame: str = ''
     parameters: dict[str, Any] = field(default_factory=dict)
+    mounts: dict[str, Pose2] = field(default_factory=dict)
     sensors: dict[int, str] = field(default_factory=dict)
     path: list[tuple[float, float]] = field(default_factory=list)
     next: int = 0
@@ -220,6 +227,12 @@ class Contents:
             if row.name in values:
                 with suppress(ParameterError):
                     self.parameters[row.name] = row.check(values[row.name])
+        mounts = values.get(MOUNTS)
+        for frame, pose in mounts.items() if isinstance(mounts, dict) else ():
+            with suppress(TypeError, ValueError, OverflowError):
+                x, y, yaw = map(float, pose)
+                if np.isfinite([x, y, yaw]).all():
+                    self.mounts[frame] = Pose2(x, y, yaw)
 
     def set_continued(self, name: object) -> None:
         """Set the file that is continued, if it is one of a journal's folder."""
@@ -238,7 +251,7 @@ class Contents:
         # not yet stated by the node that continues
         if not self.map_frame:
             self.map_frame, self.base_frame = earlier.map_frame, earlier.base_frame
-            self.parameters = dict(earlier.parameters)
+            self.parameters, self.mounts = dict(earlier.parameters), dict(earlier.mounts)
 
     def earlier_files(self, path: Path) -> Iterator[tuple[Path, Contents]]:
         """Yield the files that `path` continues, the latest one first, and their contents."""

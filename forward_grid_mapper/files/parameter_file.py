@@ -16,7 +16,7 @@ from ..core.common.former_parameters import DEPRECATED
 from ..core.common.parameter import Parameter
 from ..core.common.parameters import LOG, find
 from ..core.messages.message_types import Pose2
-from ..core.messages.mounts import TURN, mount_from
+from ..core.messages.mounts import more_than_a_turn, mount_from
 from .small_text import read_text
 
 NODE_NAME = 'forward_grid_mapper'
@@ -122,7 +122,7 @@ def parse_sensor(text: str) -> tuple[str, Pose2]:
             f'{text!r} is not of the form frame=x,y,yaw, such as sonar_left=0.1,0.15,1.57 or '
             'sonar_left=0.1,0.15,90deg: three numbers with decimal points, and no unit other than deg'
         )
-    if not degrees and TURN < abs(yaw) <= 360.0:
+    if not degrees and more_than_a_turn(yaw) and abs(yaw) <= 360.0:
         raise ParameterError(f'{text!r}: a yaw of {yaw:g} rad is more than a full turn; is it {frame}={numbers}deg?')
     return frame, mount_from(frame, [x, y, math.radians(yaw) if degrees else yaw])
 

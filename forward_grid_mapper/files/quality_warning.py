@@ -45,12 +45,10 @@ def data_warnings(maps: MapSet, source: Mapping[str, Any]) -> list[str]:
         several drives `drives`, a list of such mappings with `bag`, the name of the drive.
     """
     names = [str(drive['bag']) for drive in source.get('drives') or ()]
-    return [
-        *reading_warnings(maps.readings, source, maps.parameters),
-        # a drive that does not fit contradicts the others everywhere
-        *(fit_warnings(maps, names) or change_warnings(maps, names)),
-        *filter(None, [quality_warning(maps)]),
-    ]
+    warnings = reading_warnings(maps.readings, source, maps.parameters)
+    # a drive that does not fit contradicts the others everywhere
+    warnings += fit_warnings(maps, names) or change_warnings(maps, names)
+    return [*warnings, *filter(None, [quality_warning(maps, bool(warnings))])]
 
 
 def reading_warnings(readings: Readings, source: Mapping[str, Any], parameters: Parameters) -> list[str]:
@@ -80,8 +78,11 @@ def without_echoes(readings: Readings) -> Iterator[str]:
         )
 
 
-def quality_warning(maps: MapSet) -> str:
-    """Return the reason why the maps should not be trusted; '' if there is none."""
+def quality_warning(maps: MapSet, warned: bool = False) -> str:
+    """Return the reason why the maps should not be trusted; '' if there is none.
+
+    `warned` is whether there are warnings before this one, which may name the cause.
+    """
     count, unexplained = len(maps.readings), int(np.count_nonzero(maps.unexplained))
     if count < LEAST_READINGS or unexplained <= MANY_UNEXPLAINED * count:
         return ''
@@ -93,7 +94,7 @@ def quality_warning(maps: MapSet) -> str:
     )
     return (
         f'{unexplained} of {count} readings are most likely random measurements: the map does not fit the readings; '
-        f'{cause}'
+        f'{"if the warnings before this one do not say why: " if warned else ""}{cause}'
     )
 
 

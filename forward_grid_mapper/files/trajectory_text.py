@@ -6,7 +6,7 @@ import math
 from collections.abc import Mapping
 from typing import Any
 
-from ..core.trajectory.certainty import Estimate
+from ..core.trajectory.certainty import CalibrationEstimate
 from ..core.trajectory.odometry_model import CALIBRATION
 from ..core.trajectory.outcome import Refinement
 from ..core.trajectory.windows import Odometry
@@ -48,7 +48,10 @@ def _tum_name(kind: str, number: int | None) -> str:
 
 
 def trajectory_data(
-    outcome: Refinement, number: int | None = None, fitted: str = '', estimates: Mapping[str, Estimate] | None = None
+    outcome: Refinement,
+    number: int | None = None,
+    fitted: str = '',
+    estimates: Mapping[str, CalibrationEstimate] | None = None,
 ) -> dict[str, Any]:
     """Return the trajectory's data for the report: metres, degrees, nats, fractions and radians.
 
@@ -75,7 +78,7 @@ def trajectory_data(
     return data
 
 
-def estimate_words(estimates: Mapping[str, Estimate]) -> str:
+def estimate_words(estimates: Mapping[str, CalibrationEstimate]) -> str:
     """Return the errors of odometry that the drive determines, each with its standard deviation, in words."""
     words = []
     for name, (value, sigma) in estimates.items():

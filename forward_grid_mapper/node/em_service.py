@@ -316,7 +316,7 @@ class EmService:
         self.sensors.take(outcome.health)
         if self.online:
             self.online.adopt(maps)
-        for warning in filter(None, [*outcome.warnings, quality_warning(maps)]):
+        for warning in filter(None, [*outcome.warnings, quality_warning(maps, bool(outcome.warnings))]):
             self._logger.warning(f'EM: {warning}')
         outcome.trajectory = self._trajectory.outcome()
         said = filter(None, [summary(maps, sum(maps.statistics['seconds'].values())), outcome.trajectory])

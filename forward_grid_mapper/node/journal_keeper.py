@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import errno
+import math
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticStatus
@@ -13,9 +14,10 @@ from rclpy.node import Node
 from ..core.common.errors import OutputError
 from ..core.common.parameters import Parameters
 from ..core.common.words import counted
+from ..core.messages.message_types import Pose2
 from ..core.messages.pose_association import PoseAssociator
 from ..files.journal import Journal
-from ..files.journal_format import stated
+from ..files.journal_format import MOUNTS, stated
 from .diagnostics import status
 
 CHECK_PERIOD = 0.1
@@ -24,13 +26,25 @@ CHECK_PERIOD = 0.1
 NOTICE = 60.0
 """Seconds for which the status warns of a repaired fault; a value of the status keeps it for ever."""
 
+SAME_PLACE, SAME_YAW = 0.01, math.radians(1.0)
+"""Metres and radians up to which two poses of a sensor are the same."""
+
+MOST_NAMED = 8
+"""Most sensors that a warning names."""
+
 FULL = (errno.ENOSPC, errno.EDQUOT)
 
 
 class JournalKeeper:
     """Keeps a node's journal; does nothing if the folder is ''."""
 
-    def __init__(self, node: Node, folder: str, associator: PoseAssociator) -> None:
+    def __init__(
+        self,
+        node: Node,
+        folder: str,
+        associator: PoseAssociator,
+        mounts: Callable[[], Mapping[str, Pose2]] = dict,
+    ) -> None:
         """Prepare; call `open` and `restore` before anything else.
 
         Parameters
@@ -39,8 +53,12 @@ class JournalKeeper:
             Its attribute `parameters` holds the parameters of the mapper.
         folder : str
         associator : PoseAssociator
+        mounts : callable
+            Returns the poses of the sensors that have readings and are fixed to the robot, by frame.
         """
-        self._node = node
+        self._node, self._mounts = node, mounts
+        # of the journal, and of this run
+        self._known_mounts: dict[str, Pose2] = {}
         self._associator = associator
         self._journal: Journal | None = None
         self._folder = folder
@@ -94,6 +112,7 @@ class JournalKeeper:
         for readings in journal.restore():
             refused += associator.restore(readings)
         associator.map_frame, associator.base_frame = journal.contents.map_frame, journal.contents.base_frame
+        self._known_mounts = dict(journal.contents.mounts)
         for point in journal.contents.path:
             associator.extend_path(point)
         self._restored = self._taken = len(associator.buffer)
@@ -127,15 +146,26 @@ class JournalKeeper:
             journal.put(new, frames, points)
 
     def _describe(self, journal: Journal) -> None:
-        parameters = self._node.parameters
-        if parameters is not self._parameters:
-            self._parameters = parameters
-            journal.parameters = stated(parameters)
+        parameters, mounts = self._node.parameters, self._mounts()
+        known = {**self._known_mounts, **mounts}
+        if parameters is self._parameters and known == self._known_mounts:
+            return
+        before = self._known_mounts
+        if moved := sorted(frame for frame in mounts if frame in before and _moved(before[frame], mounts[frame])):
+            self._node.get_logger().warning(
+                f'journal {journal.path}: the pose on the robot of {", ".join(moved[:MOST_NAMED])}'
+                f'{" and others" if len(moved) > MOST_NAMED else ""} is another one than for earlier readings, which '
+                'stay where they were mapped; if it was wrong before, call reset to begin a new drive'
+            )
+        self._parameters, self._known_mounts = parameters, known
+        poses = {MOUNTS: {frame: list(pose) for frame, pose in known.items()}} if known else {}
+        journal.parameters = stated(parameters) | poses
 
     def reset(self) -> str:
         """Begin a new drive after readings were forgotten; return the file of the old ones, in words."""
         self._restored = self._taken = 0
         self._last_point = None
+        self._known_mounts, self._parameters = {}, None
         if self._journal is None:
             return ''
         old = self._journal.path
@@ -169,3 +199,9 @@ class JournalKeeper:
             }
         level = DiagnosticStatus.WARN if trouble else DiagnosticStatus.OK
         return [status(f'{name}: journal', level, trouble or 'writing', name, values)]
+
+
+def _moved(before: Pose2, now: Pose2) -> bool:
+    """Return whether a sensor has another pose on the robot."""
+    turned = abs(math.remainder(now.yaw - before.yaw, 2 * math.pi))
+    return math.dist(before[:2], now[:2]) > SAME_PLACE or turned > SAME_YAW

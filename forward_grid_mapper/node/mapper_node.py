@@ -180,7 +180,8 @@ class MapperNode(ManagedNode):
         following = self.trajectory.following
         self._readings_worker = Worker('readings', self.get_logger().error)
         self._ends += [partial(part.close, 0.5) for part in (self.saver, self._readings_worker)]
-        self.journal = JournalKeeper(self, self.parameters.node.journal, self.associator)
+        extrinsics = self._extrinsics
+        self.journal = JournalKeeper(self, self.parameters.node.journal, self.associator, lambda: extrinsics.fixed)
         self.workers = [self._readings_worker, self.live.worker, self.maps.worker, self.em.worker.worker]
         self.workers += [part.worker for part in (self.saver, self.online, following, self.kernels) if part]
         health = Health()

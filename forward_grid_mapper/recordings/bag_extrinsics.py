@@ -32,7 +32,8 @@ class BagExtrinsics:
     Attributes
     ----------
     steep, used, unusable : dict of str
-        By frame: why a sensor is too steep for a planar map, the source of its pose, and why its transform is invalid.
+        By frame: where a sensor looks that is too steep for a planar map, up or down; the source of its pose; and why
+        its transform is invalid.
     doubts : dict
         Warnings about doubtful poses, in order.
     """
@@ -92,7 +93,7 @@ class BagExtrinsics:
                 pose = self._others.lookup(base_frame, frame)
                 where = f'/tf_static of {self._others.used.get(frame)}'
         except SteepSensorError as error:
-            self.steep[frame] = str(error)
+            self.steep[frame] = error.side
             return STEEP
         except InputError as error:
             self.unusable[frame] = str(error)
@@ -126,6 +127,16 @@ class BagExtrinsics:
     def notes(self) -> list[str]:
         """Warnings about the sources of poses."""
         return [*self.doubts, *self._others.notes()]
+
+    def too_steep(self, base_frame: str) -> list[str]:
+        """Return warnings about sensors that are too steep: one for all that look up, and one for all that look down.
+
+        They often have the same fault, such as another axis in the direction of the beam.
+        """
+        by_side: dict[str, list[str]] = {}
+        for frame, side in self.steep.items():
+            by_side.setdefault(side, []).append(frame.lstrip('/'))
+        return [str(SteepSensorError(frames, side, base_frame.lstrip('/'))) for side, frames in by_side.items()]
 
     @property
     def unused(self) -> list[str]:

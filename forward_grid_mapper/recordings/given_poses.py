@@ -46,7 +46,7 @@ class GivenPoses(NamedTuple):
 
 
 def read_given_poses(path: Path | str) -> GivenPoses:
-    """Read poses in the format of the TUM benchmark, or as CSV, if the first line has commas.
+    """Read poses in the format of the TUM benchmark, or as CSV, if the first line that is no comment has commas.
 
     Raises
     ------
@@ -75,7 +75,12 @@ def _is_csv(path: Path) -> bool:
         )
     try:
         with path.open(encoding='utf-8', errors='replace') as lines:
-            first = next((line for line in lines if line.strip()), '')
+            # the names of columns may be a comment, and so may a sentence with a comma
+            first = ''
+            for line in filter(str.strip, lines):
+                first = line
+                if not line.lstrip().startswith('#'):
+                    break
     except OSError as error:
         raise InputError(f'{readable(path)} cannot be read: {error.strerror or error}') from None
     return ',' in first or ';' in first

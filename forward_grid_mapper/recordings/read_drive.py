@@ -188,7 +188,7 @@ def _warnings(bag: Bag, associator: PoseAssociator, lookup: BagExtrinsics) -> li
         warnings.append(skipped(count, topic))
     if associator.unknown_frames:
         warnings.append(lookup.advice(associator.base_frame, sorted(associator.unknown_frames)))
-    warnings += [*lookup.steep.values(), *lookup.notes, *far_mounts(lookup.poses)]
+    warnings += [*lookup.too_steep(associator.base_frame), *lookup.notes, *far_mounts(lookup.poses)]
     if unused := lookup.unused:
         warnings.append(
             f'poses were given for {", ".join(unused)}, but no reading has such a frame; is the name right?'
@@ -252,7 +252,8 @@ def _nothing_associated(
         reasons = f'none of {counted(refused.total(), "odometry message")} could be used'
     for reason, count in refused.most_common():
         reasons += f'; {count} odometry messages were rejected: {ODOMETRY_REASONS[reason]}'
-    hints = ''.join(f'; {warning}' for warning in (*lookup.steep.values(), *associator.limits.warnings()))
+    faults = *lookup.too_steep(associator.base_frame), *associator.limits.warnings()
+    hints = ''.join(f'; {warning}' for warning in faults)
     if associator.unknown_frames:
         hints += f'; {lookup.advice(associator.base_frame, sorted(associator.unknown_frames))}'
     return InputError(f'all {associator.received} readings were rejected: {reasons}{hints}')

@@ -15,7 +15,7 @@ from ..core.common.parameters import Parameters
 from ..core.common.readings import Readings, of_drives
 from ..core.maps.map_set import MapSet
 from ..core.messages.reading_buffer import bounded
-from ..core.trajectory.certainty import YAW_ERRORS, Estimate, combined_calibration, determined_calibration
+from ..core.trajectory.certainty import YAW_ERRORS, CalibrationEstimate, combined_calibration, determined_calibration
 from ..core.trajectory.odometry_model import CALIBRATION, calibrated
 from ..core.trajectory.outcome import Refinement, replaced
 from ..core.trajectory.poses import relative
@@ -59,7 +59,7 @@ class RefinedDrives:
     drives: Drives
     odometry: tuple[Odometry, ...]
     outcomes: tuple[Refinement, ...]
-    estimates: tuple[dict[str, Estimate], ...]
+    estimates: tuple[dict[str, CalibrationEstimate], ...]
 
     @property
     def moved(self) -> bool:
@@ -177,7 +177,7 @@ def _estimates(
     parameters: Parameters,
     watch: Watch,
     given: GivenCalibration | None,
-) -> dict[str, Estimate]:
+) -> dict[str, CalibrationEstimate]:
     if not outcome.accepted or not outcome.calibration:
         return {}
     watch('calibration of odometry', 0.0)

@@ -208,7 +208,7 @@ class ScaledMapper:
         """Search until no tile changes; return counts. `boxes` has the tiles in the order of the first searches."""
         result = self._each('search', search, boxes, FIRST, name='search, first maps')
         schedule, step, rounds = Schedule(boxes), FIRST, 0
-        colours = [[number for number in boxes if number in set(colour)] for colour in tiling.colours]
+        colours = [[number for number in boxes if number in members] for members in map(set, tiling.colours)]
         while schedule.stale:
             rounds += 1
             for k, colour in enumerate(colours, 1):

@@ -151,7 +151,9 @@ def layers_in(job: Job, box: Grid) -> dict[str, NDArray[Any]]:
 def _dynamic(job: Job, tiling: Tiling, box: Grid) -> NDArray[np.float32]:
     """Return the sum of the counts of tiles in their boxes, which overlap."""
     out = np.zeros(box.shape, np.float32)
-    for tile in tiling.tiles:
+    # a region has a few tiles of the thousands of a large map
+    for number in tiling.with_boxes_in(box):
+        tile = tiling.tiles[number]
         result = outcome_in(job.folder.tile(tile.row, tile.column, 'ground.npz'))
         if result is None or not result['readings']:
             continue
@@ -246,6 +248,14 @@ def _create(path: Path, grid: Grid, levels: int) -> None:
     group.attrs['rows'] = 'row 0 has the smallest y'
 
 
+def is_empty(name: str, values: NDArray[Any]) -> bool:
+    """Return whether a region of a map has only the value that `_create` fills in, so that it need not be written."""
+    if name == 'dynamic':
+        return not values.any()
+    # where the robot traversed, the uncertainty map is 0
+    return bool((values == UNKNOWN if values.dtype == np.int8 else np.isnan(values)).all())
+
+
 @task
 def write_region(job: Job, number: int, folder: str, level: int) -> dict[str, Any]:
     """Write a region at full resolution: chunks, and parts for map_server unless all cells are unknown."""
@@ -258,8 +268,7 @@ def write_region(job: Job, number: int, folder: str, level: int) -> dict[str, An
     layers = layers_in(job, box)
     files = []
     for name, values in layers.items():
-        known = values != UNKNOWN if values.dtype == np.int8 else np.isfinite(values) & (values != 0)
-        if not known.any():
+        if is_empty(name, values):
             continue
         array = zarr.open(str(_array(target, level, name)), mode='r+')
         array[row : row + box.height, column : column + box.width] = values

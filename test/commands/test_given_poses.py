@@ -66,6 +66,14 @@ def test_poses_from_a_file_give_the_readings_of_odometry(tmp_path: Path, kind: s
         np.testing.assert_allclose(turn, 0.0, atol=1e-4)
 
 
+def test_comments_may_have_commas(tmp_path: Path) -> None:
+    whole = read_given_poses(written(tmp_path / 'poses', 'tum'))
+    (tmp_path / 'noted').write_text('# SLAM, second run\n\n' + (tmp_path / 'poses').read_text())
+    np.testing.assert_array_equal(read_given_poses(tmp_path / 'noted').pose, whole.pose)
+    (tmp_path / 'named').write_text('# stamp,x,y,yaw\n1,2,3,0\n')
+    assert read_given_poses(tmp_path / 'named').pose.tolist() == [[2.0, 3.0, 0.0]]
+
+
 def test_odometry_of_the_bag_is_ignored(tmp_path: Path) -> None:
     moved = tape()._replace(
         odometry=[m._replace(pose=m.pose._replace(x=m.pose.x + 5)) for m in tape().odometry if m.pose]

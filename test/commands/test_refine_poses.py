@@ -15,7 +15,7 @@ from forward_grid_mapper.commands.simulate import write_recording
 from forward_grid_mapper.core.common.parameters import Parameters
 from forward_grid_mapper.core.common.readings import in_canonical_order
 from forward_grid_mapper.core.messages.message_types import Pose2
-from forward_grid_mapper.core.trajectory.certainty import Estimate
+from forward_grid_mapper.core.trajectory.certainty import CalibrationEstimate
 from forward_grid_mapper.core.trajectory.odometry_model import calibrated
 from forward_grid_mapper.core.trajectory.poses import rms_after_alignment
 from forward_grid_mapper.core.trajectory.windows import Odometry
@@ -102,7 +102,9 @@ def test_given_calibration_is_applied(tmp_path: Path, capsys: pytest.CaptureFixt
     write_tape(tmp_path / 'bag', exact)
     write_tape(tmp_path / 'bent', exact._replace(odometry=bent))
     file = tmp_path / 'calibration.yaml'
-    file.write_text(calibration_text({name: Estimate(value, 0.001) for name, value in wrong.items()}, 'another drive'))
+    file.write_text(
+        calibration_text({name: CalibrationEstimate(value, 0.001) for name, value in wrong.items()}, 'another drive')
+    )
     mapped(tmp_path / 'bag', tmp_path / 'plain', '-q')
     report = mapped(tmp_path / 'bent', tmp_path / 'maps', '-q', '--odometry-calibration', file)
     assert report['input']['trajectory']['calibrated'] == str(file)

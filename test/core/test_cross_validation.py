@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import numpy as np
 import pytest
 
@@ -33,6 +35,13 @@ def test_each_reading_is_held_out_once_together_with_its_block() -> None:
         assert len(set(fold[blocks == block].tolist())) == 1
 
 
+def test_drive_with_pauses_has_all_folds() -> None:
+    """Readings of 2 s, ten times, with pauses of 8 s."""
+    stamp = READINGS.stamp.min() + np.arange(1000) // 100 * 10_000_000_000 + np.arange(1000) % 100 * 19_000_000
+    fold = folds_of(dataclasses.replace(READINGS.select(slice(1000)), stamp=stamp))
+    assert np.bincount(fold).tolist() == [200] * FOLDS
+
+
 def test_held_out_readings_are_not_used_in_learning(monkeypatch: pytest.MonkeyPatch) -> None:
     learned_from: list[set[int]] = []
     judged: list[set[int]] = []
@@ -45,6 +54,14 @@ def test_held_out_readings_are_not_used_in_learning(monkeypatch: pytest.MonkeyPa
         judged.append(set(held.stamp.tolist()))
         return np.zeros(len(held))
 
+    made: list[tuple[int, object]] = []
+    run = Mapper.run
+
+    def map_of(self: Mapper, readings: Readings, *args: object, **options: object) -> object:
+        made.append((int(readings.stamp.sum()), self._parameters))
+        return run(self, readings, *args, **options)  # type: ignore[arg-type]
+
+    monkeypatch.setattr(Mapper, 'run', map_of)
     monkeypatch.setattr(module, 'learn_jointly', learn)
     monkeypatch.setattr(module, 'log_likelihoods', judge)
     assert cross_validated(READINGS, Parameters(), 1) == CrossValidation(0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
@@ -52,6 +69,7 @@ def test_held_out_readings_are_not_used_in_learning(monkeypatch: pytest.MonkeyPa
     for k, stamps in enumerate(learned_from):
         assert all(not stamps & held for held in judged[4 * k : 4 * k + 4])
     assert set().union(*judged) == set(READINGS.stamp.tolist())
+    assert len(made) == len(set(made)) == 2 * FOLDS, 'a map is made twice'
 
 
 def test_likelihood_does_not_depend_on_the_grid() -> None:

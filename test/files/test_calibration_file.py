@@ -9,14 +9,14 @@ import pytest
 import yaml
 
 from forward_grid_mapper.core.common.errors import ParameterError
-from forward_grid_mapper.core.trajectory.certainty import Estimate
+from forward_grid_mapper.core.trajectory.certainty import CalibrationEstimate
 from forward_grid_mapper.files.calibration_file import calibration_text, load_calibration
 
 CALIBRATION = {
-    'scale': Estimate(0.012, 0.004),
-    'heading': Estimate(-0.01, 0.003),
-    'bias': Estimate(math.radians(0.5), math.radians(0.1)),
-    'turn_scale': Estimate(-0.02, 0.005),
+    'scale': CalibrationEstimate(0.012, 0.004),
+    'heading': CalibrationEstimate(-0.01, 0.003),
+    'bias': CalibrationEstimate(math.radians(0.5), math.radians(0.1)),
+    'turn_scale': CalibrationEstimate(-0.02, 0.005),
 }
 
 

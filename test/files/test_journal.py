@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import errno
 import functools
+import math
 import os
 import random
 import resource
@@ -66,12 +67,14 @@ def test_parameters_of_the_node_are_read_back(tmp_path: Path) -> None:
     journal, _ = opened(tmp_path)
     journal.parameters = {'resolution': 0.05, 'max_readings': 7, 'over_range': 'discard', 'unheard_of': 1, 'p_hit': 9.0}
     written(journal, made(0, 10))
-    journal.parameters = {**journal.parameters, 'max_readings': 8}
+    mounts = {'left': [0.1, 0.2, 1.5], 'right': [0.1, 'a', 0], 'far': [math.inf, 0, 0], 'none': None, 'more': [1] * 4}
+    journal.parameters = {**journal.parameters, 'max_readings': 8, 'sensors': mounts}
     written(journal, made(10, 10))
     journal.close()
     _, contents = numbers(journal.path)
     # unknown or invalid parameters are ignored
     assert contents.parameters == {'resolution': 0.05, 'max_readings': 8, 'over_range': 'discard'}
+    assert contents.mounts == {'left': (0.1, 0.2, 1.5)}
     assert contents.harm == ''
 
 

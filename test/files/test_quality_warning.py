@@ -11,6 +11,7 @@ import pytest
 
 from forward_grid_mapper.core.common.errors import OutputError
 from forward_grid_mapper.core.common.parameters import Parameters
+from forward_grid_mapper.core.common.readings import Readings
 from forward_grid_mapper.core.mapping import Mapper
 from forward_grid_mapper.files.quality_warning import data_warnings, jumps_warning, quality_warning
 from forward_grid_mapper.files.results import write_results
@@ -36,6 +37,25 @@ def test_warning_if_no_map_explains_the_readings(tmp_path: Path) -> None:
     with pytest.raises(OutputError, match='too late'):
         write_results(tmp_path / 'refused', wild, {}, np.zeros((0, 2)), 'wild', agree=refuse)
     assert [path.name for path in tmp_path.iterdir()] == ['maps'], 'whoever waited for the maps has gone'
+
+
+def test_map_that_does_not_fit_refers_to_the_causes_before() -> None:
+    """All sensors have one frame_id, which is said first."""
+    k = np.arange(2000)
+    ranges = np.array([0.5, 2.0, 3.0, 1.2, 2.6, 0.8, 1.7])[k % 7]
+    shared = Readings.from_columns(
+        ('sonar',),
+        x=2.0 * np.cos(0.002 * k),
+        y=2.0 * np.sin(0.002 * k),
+        yaw=0.002 * k,
+        z=ranges,
+        z_max=4.0,
+        half_angle=0.13,
+        stamp=k * 20_000_000,
+    )
+    *causes, last = data_warnings(Mapper(Parameters()).run(shared), {})
+    assert len(causes) == 1 and 'do all sensors have the same frame_id' in causes[0]
+    assert 'if the warnings before this one do not say why: are the poses of the sensors' in last
 
 
 def test_odometry_that_has_only_velocities_is_named_if_the_map_does_not_fit() -> None:

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from forward_grid_mapper.core.common.readings import Readings
-from forward_grid_mapper.core.trajectory.certainty import Estimate
+from forward_grid_mapper.core.trajectory.certainty import CalibrationEstimate
 from forward_grid_mapper.core.trajectory.outcome import Refinement
 from forward_grid_mapper.core.trajectory.windows import Odometry
 from forward_grid_mapper.files.pose_files import poses_from_tum
@@ -43,7 +43,7 @@ def test_calibration_in_words() -> None:
     # turns that are measured twice as large as they are have the factor 0.5
     assert calibration_words({'turn_scale': -0.5}) == 'turns are measured 100.0 % too large'
     assert estimate_words({}) == 'the drive does not determine the errors of the wheels'
-    assert estimate_words({'scale': Estimate(0.25, 0.025)}).startswith(
+    assert estimate_words({'scale': CalibrationEstimate(0.25, 0.025)}).startswith(
         'distances are measured 20.0 % too short (± 1.6 %)'
     )
     assert '1.0° to the right of' in calibration_words({'heading': -math.radians(1.0)})
@@ -53,7 +53,7 @@ def test_report_has_the_calibration_with_its_accuracy() -> None:
     path = Odometry(np.array([0, 10**9]), np.zeros((2, 3)))
     nothing = Readings.from_columns(x=[], y=[], yaw=[], z=[], z_max=[], half_angle=[])
     outcome = Refinement(True, 'readings are predicted better', nothing, path, {'scale': 0.01})
-    data = trajectory_data(outcome, estimates={'scale': Estimate(0.01, 0.002)})
+    data = trajectory_data(outcome, estimates={'scale': CalibrationEstimate(0.01, 0.002)})
     assert data['calibration_estimates'] == {'scale': {'value': 0.01, 'sigma': 0.002}}
     assert 'measure a straight line' in ' '.join(report_text({'input': {'trajectory': data}}).split())
 

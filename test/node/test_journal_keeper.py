@@ -18,6 +18,7 @@ from stand_ins import SONAR, PlainNode
 from forward_grid_mapper.core.common.errors import OutputError
 from forward_grid_mapper.core.common.parameters import Parameters
 from forward_grid_mapper.core.common.readings import Readings
+from forward_grid_mapper.core.messages.message_types import Pose2
 from forward_grid_mapper.core.messages.pose_association import PoseAssociator
 from forward_grid_mapper.files.journal_format import Contents
 from forward_grid_mapper.files.journal_reader import read
@@ -44,7 +45,8 @@ class KeptJournal:
         parameters = Parameters.from_flat(values)
         self.node = Node(parameters)
         self.associator = PoseAssociator(lambda base, frame, stamp: SONAR, parameters)
-        self.keeper = JournalKeeper(self.node, str(folder), self.associator)  # type: ignore[arg-type]
+        self.mounts: dict[str, Pose2] = {}
+        self.keeper = JournalKeeper(self.node, str(folder), self.associator, lambda: self.mounts)  # type: ignore[arg-type]
         self.keeper.open()
 
     def start(self) -> KeptJournal:
@@ -122,6 +124,30 @@ def test_new_readings_are_written_and_restored(tmp_path: Path) -> None:
     found, contents = stored(tmp_path / 'drive_0001.journal')
     assert found == list(range(15)), 'none is there twice'
     assert contents.path == [(0.0, 1.0), (5.0, 1.0)]
+
+
+def test_sensor_that_was_moved_since_earlier_readings_is_named(tmp_path: Path) -> None:
+    def run(**mounts: Pose2) -> tuple[list[str], KeptJournal]:
+        kept = KeptJournal(tmp_path).start()
+        kept.drive(len(kept.associator.buffer), 5)
+        kept.mounts.update(mounts)
+        kept.keeper.take()
+        kept.keeper.close()
+        return [text for text in kept.node.warned if 'pose on the robot' in text], kept
+
+    left, right = Pose2(0.1, 0.2, 1.0), Pose2(0.1, -0.2, -1.0)
+    assert run(left=left, right=right)[0] == []
+    assert run(left=left._replace(yaw=1.0 + 2 * np.pi))[0] == [], 'that of the right one is not known yet'
+    (warning,), _ = run(left=left, right=right._replace(yaw=-0.5))
+    assert 'robot of right is another one than for earlier readings' in warning and 'call reset' in warning
+    assert run(left=left, right=right._replace(yaw=-0.5))[0] == [], 'it is said once'
+    kept = KeptJournal(tmp_path).start()
+    kept.keeper.reset()
+    kept.mounts['left'] = right
+    kept.drive(0, 1)
+    kept.keeper.take()
+    kept.keeper.close()
+    assert not any('pose on the robot' in text for text in kept.node.warned), 'a new drive has no earlier readings'
 
 
 def test_new_journal_has_no_frame(tmp_path: Path) -> None:

@@ -75,5 +75,13 @@ def test_sensor_that_looks_at_the_floor_is_left_out_and_named(bag: Path, monkeyp
 
 
 def test_drive_with_only_steep_sensors_is_rejected(bag: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    with pytest.raises(InputError, match=r'all .* were rejected: .* steep_sensor .*looks up, more than 60°'):
+    with pytest.raises(InputError, match=r'all .* were rejected: .* steep_sensor .*look up, more than 60°'):
         read(bag, monkeypatch, **{frame: -1.3 for frame, _ in tape().extrinsics})
+
+
+def test_one_fault_of_many_sensors_gives_one_warning(bag: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    first, *others = (frame for frame, _ in tape().extrinsics)
+    level, drive = read(bag, monkeypatch), read(bag, monkeypatch, **dict.fromkeys(others, 1.5))
+    (warning,) = set(drive.source['warnings']) - set(level.source['warnings'])
+    assert warning.startswith(f'Sensors {", ".join(map(repr, others))} look down, more than 60° out of the plane')
+    assert f"'{first}'" not in warning

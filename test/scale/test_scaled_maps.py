@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import math
 from pathlib import Path
 
 import numpy as np
@@ -16,6 +17,7 @@ from forward_grid_mapper.files.map_archive import read_npz
 from forward_grid_mapper.files.map_files import read_map
 from forward_grid_mapper.recordings.drive import WHOLE
 from forward_grid_mapper.scale.job import DriveArguments
+from forward_grid_mapper.scale.work_folder import outcome_in
 from forward_grid_mapper.simulation.campus import campus_drive
 from forward_grid_mapper.simulation.sonar import front_array
 
@@ -94,9 +96,13 @@ def test_large_maps_are_written_in_parts(
 
     for name, value in (('MOST_CELLS_OF_A_FILE', 0), ('REGION', 64), ('OVERVIEW', 60)):
         monkeypatch.setattr(output, name, value)
+    read: list[Path] = []
+    monkeypatch.setattr(output, 'outcome_in', lambda path: read.append(path) or outcome_in(path))
     copy_of(finished / 'work', tmp_path / 'work')
     folder = made_here(drives, tmp_path, Here())
     maps = read_npz(one_process / 'maps.npz')
+    tiles, regions = len(set(read)), math.prod(-(-side // 64) for side in maps.grid.shape)
+    assert len(read) < 0.75 * tiles * regions, 'each region reads all tiles'
     assert {path.name for path in folder.iterdir()} == {
         'maps.zarr',
         'tiles',
@@ -128,6 +134,16 @@ def test_large_maps_are_written_in_parts(
             assert grid.shape == tuple(entry['shape'])
             seen[maps.grid.window(grid)] = np.nan_to_num(probability, nan=-1)
     np.testing.assert_array_equal(seen, maps.ml)
+
+
+@scaled
+def test_region_that_was_only_traversed_is_written() -> None:
+    from forward_grid_mapper.scale.output import is_empty
+
+    unknown, known = np.full((2, 3), np.nan, np.float32), np.array([[np.nan, 0.0]], np.float32)
+    assert is_empty('uncertainty_map', unknown) and not is_empty('uncertainty_map', known)
+    assert is_empty('dynamic', np.zeros((2, 3), np.float32)) and not is_empty('dynamic', np.ones((2, 3), np.float32))
+    assert is_empty('ml_map', np.full((2, 3), -1, np.int8)) and not is_empty('ml_map', np.zeros((2, 3), np.int8))
 
 
 @scaled

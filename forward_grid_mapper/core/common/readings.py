@@ -51,6 +51,8 @@ class Readings:
     drive: NDArray[np.int32] = field(default_factory=lambda: np.zeros(0, np.int32))
 
     def __post_init__(self) -> None:
+        if len(self.drive) not in (0, len(self.z)):
+            raise ValueError(f'{len(self.z)} readings cannot have the drives of {len(self.drive)}')
         if len(self.drive) != len(self.z):
             # a broadcast view takes no memory
             object.__setattr__(self, 'drive', np.broadcast_to(np.int32(0), self.z.shape))
@@ -82,20 +84,21 @@ class Readings:
         Raises
         ------
         ValueError
-            If a column's shape is not that of `z`.
+            If a column is missing or unknown, or its shape is not that of `z`.
         """
+        known = [column.name for column in fields(cls) if column.name != 'sensor_names']
+        if unknown := sorted(columns.keys() - set(known)):
+            raise ValueError(f'there is no column {", ".join(unknown)}; there are: {", ".join(known)}')
+        if 'z' not in columns:
+            raise ValueError('column z is missing')
         z = np.atleast_1d(np.asarray(columns['z'], np.float64))
         types = {'stamp': np.int64, 'sensor': np.int32, 'drive': np.int32}
         made = {}
-        for column in fields(cls):
-            if column.name == 'sensor_names':
-                continue
-            kind = types.get(column.name, np.float64)
-            optional = column.name in ('sigma', 'stamp', 'sensor', 'drive')
-            value = columns.get(column.name, 0 if optional else None)
+        for name in known:
+            value = columns.get(name, 0 if name in ('sigma', 'stamp', 'sensor', 'drive') else None)
             if value is None:
-                raise ValueError(f'column {column.name} is missing')
-            made[column.name] = np.array(np.broadcast_to(np.asarray(value, kind), z.shape))
+                raise ValueError(f'column {name} is missing')
+            made[name] = np.array(np.broadcast_to(np.asarray(value, types.get(name, np.float64)), z.shape))
         return cls(**made, sensor_names=tuple(names))
 
 

@@ -22,7 +22,7 @@ from typing import NamedTuple
 import numpy as np
 
 from ..common.parameters import Parameters
-from ..common.readings import Readings
+from ..common.readings import Floats, Readings
 from ..messages.message_types import NANOSECONDS, Pose2
 from .sensor_calibration import (
     FORWARD,
@@ -228,10 +228,24 @@ def _axis_faults(drive: MountedReadings) -> Iterator[_Fault]:
     at, directions = drive.travel()
     if np.ptp(yaw) < SAME_YAW and len(at) >= 2:
         yield _Fault(
-            'the yaw of odometry never changes, although the robot turns; does its driver leave out the orientation? '
-            'Correct the driver',
+            f'{_constant_yaw_words(float(yaw[0]), directions)} Correct the driver',
             drive.placed(robot=np.stack([x, y, np.interp(np.arange(len(x)), at, np.unwrap(directions))])),
         )
+
+
+def _constant_yaw_words(yaw: float, directions: Floats) -> str:
+    """Return what is wrong with a yaw that never changes, radians, if the robot drives in these directions."""
+    # doubled angles, since a robot that drives back along a line need not turn
+    mean = np.mean(np.exp(2j * directions))
+    if abs(mean) < ALIGNED_LENGTH:
+        return 'the yaw of odometry never changes, although the robot turns; does its driver leave out the orientation?'
+    # of the two directions along the line, that in which it mostly drives
+    along = np.angle(mean) / 2
+    forwards = along if np.cos(directions - along).sum() > 0.0 else math.remainder(along + math.pi, 2 * math.pi)
+    return (
+        f'the yaw of odometry is always {yaw:.2f} rad, but the robot drives in the direction {forwards:.2f} rad; does '
+        'its driver leave out the orientation, or is the yaw in degrees?'
+    )
 
 
 def _yaw_unit_warning(drive: MountedReadings) -> str:

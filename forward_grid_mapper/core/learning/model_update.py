@@ -58,9 +58,9 @@ def learn(forward: ForwardModel, occupied: NDArray[Any]) -> ModelParameters:
         name: float(np.clip(value, find(name).low, find(name).high)) for name, value in values.items()
     }
     # with a map that explains nothing, the model must stay valid
-    excess = bounded['p_rand'] + bounded.get('p_lost', 0.0)
-    if excess > MOST_UNEXPLAINED:
-        for name in ('p_rand', 'p_lost'):
-            if name in bounded:
-                bounded[name] *= MOST_UNEXPLAINED / excess
+    together = bounded['p_rand'] + bounded.get('p_lost', 0.0)
+    if together > MOST_UNEXPLAINED:
+        bounded['p_rand'] = max(bounded['p_rand'] * MOST_UNEXPLAINED / together, find('p_rand').low)
+        if 'p_lost' in bounded:
+            bounded['p_lost'] = MOST_UNEXPLAINED - bounded['p_rand']
     return dataclasses.replace(model, **bounded)

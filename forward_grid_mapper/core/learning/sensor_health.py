@@ -193,9 +193,9 @@ def _readings_by_column(
 
 def _place_counts(readings: Readings, marks: Mapping[str, NDArray[np.bool_]]) -> dict[str, NDArray[np.int64]]:
     """Return from how many places and directions each sensor has readings, random and short ones, shape (S,)."""
-    poses = np.column_stack(
-        [readings.sensor, *(np.floor(v / PLACE_SIZE) for v in (readings.x, readings.y, readings.yaw))]
-    )
+    # after a full turn the direction is the same
+    pose = readings.x, readings.y, np.remainder(readings.yaw, 2 * math.pi)
+    poses = np.column_stack([readings.sensor, *(np.floor(v / PLACE_SIZE) for v in pose)])
     # sorted once, by columns, since np.unique takes seconds for a million rows
     order = np.lexsort(poses.T)
     poses = poses[order]

@@ -25,7 +25,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..common.constants import HIT_LENGTH
+from ..common.constants import HIT_LENGTH, MOST_HIT
 from ..common.parameter_groups import ModelParameters
 from ..common.parameters import find
 from ..common.readings import Floats, Readings
@@ -135,6 +135,8 @@ def _held(name: str, model: ModelParameters, resolution: float, informed: float)
         return 'it lies below half a cell, which is used instead'
     if value < row.low + _NEAR or value > row.high - _NEAR:
         return f'it lies at a bound of the admitted range, {row.range}'
+    if name == 'p_hit' and hit_probability(model, resolution) > MOST_HIT - _NEAR:
+        return f'that of a cell lies at its largest value, {MOST_HIT:g}'
     return ''
 
 

@@ -91,8 +91,8 @@ class MountedReadings:
         """Return indices of readings between which the robot drove `STEP`, and the direction of travel, radians."""
         x, y, _ = self.robot
         driven = np.concatenate([[0.0], np.cumsum(np.hypot(np.diff(x), np.diff(y)))])
-        at = np.searchsorted(driven, np.arange(STEP, driven[-1], STEP))
-        at = at[np.diff(at, prepend=-1) > 0]
+        # not by a list of all steps, of which there are millions if odometry jumps to and fro
+        at = np.flatnonzero(np.diff(np.floor(driven / STEP), prepend=0.0))
         return at[:-1], np.arctan2(np.diff(y[at]), np.diff(x[at]))
 
     def placed(self, robot: Floats | None = None, extrinsics: Floats | None = None) -> Readings:

@@ -17,10 +17,11 @@ from ..common.constants import EXTENSION, FREE_MARGIN
 from ..common.grid import UNKNOWN
 from ..common.parameter_groups import SearchParameters
 from ..evidence.evidence import Evidence
+from ..evidence.neighbourhood import DX, DY, NEIGHBOURS
 from ..search.prior import has_walls
 from .free_space import expected_passes
 from .line_of_sight import mirror_images, not_passed
-from .post_processing import grown, grown_through, post_process
+from .post_processing import grown, post_process
 from .uncertainty import uncertainty_map
 
 LEAST_PROBABILITY = 0.5
@@ -73,9 +74,13 @@ def unlikely_obstacles(ml: NDArray[np.int8], probability: NDArray[np.float32]) -
     likely = occupied & (probability >= LEAST_PROBABILITY)
     for edge in (np.s_[:1], np.s_[-1:], np.s_[:, :1], np.s_[:, -1:]):
         likely[edge] = occupied[edge]
-    grows = True
-    while grows:
-        before, likely = likely, grown_through(likely, occupied, 1)
-        grows = not np.array_equal(before, likely)
-    out: NDArray[np.bool_] = occupied & ~likely
-    return out
+    # with a border, so that all cells have eight neighbours
+    height, width = ml.shape[0] + 2, ml.shape[1] + 2
+    remaining, front = (np.pad(cells, 1).ravel() for cells in (occupied & ~likely, likely))
+    front = np.flatnonzero(front)
+    around = np.array([DY[k] * width + DX[k] for k in range(NEIGHBOURS)])
+    while len(front):
+        near = (front[:, None] + around).ravel()
+        front = np.unique(near[remaining[near]])
+        remaining[front] = False
+    return remaining.reshape(height, width)[1:-1, 1:-1]

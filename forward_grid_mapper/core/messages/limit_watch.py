@@ -136,9 +136,10 @@ class LimitWatch:
 
 
 def _usable(values: Floats) -> NDArray[np.bool_]:
-    """Return which messages have a range and a limit, shape (N,)."""
-    ranges, _, limits = values.T
-    usable: NDArray[np.bool_] = np.isfinite(ranges) & (ranges > 0) & (limits > 0) & (limits < np.inf)
+    """Return which messages have a range and limits that do not contradict each other, shape (N,)."""
+    ranges, least, limits = values.T
+    stated = (limits > 0) & (limits < np.inf) & (least <= limits)
+    usable: NDArray[np.bool_] = np.isfinite(ranges) & (ranges > 0) & stated
     return usable
 
 
@@ -196,7 +197,7 @@ def _larger_than_limits(samples: Floats, sensor: NDArray[np.int64] | None) -> st
 
 def _smaller_than_limits(samples: Floats, sensor: NDArray[np.int64] | None) -> str:
     ranges, least, limits = samples
-    # limits that contradict each other are rejected for that
+    # for fixed-distance rangers, both limits are equal
     below = (ranges < least) & (least < limits)
     count = int(below.sum())
     if not _are_many(below, sensor):

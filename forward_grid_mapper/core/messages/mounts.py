@@ -10,10 +10,15 @@ from ..common.errors import ParameterError
 from .message_types import Pose2
 
 TURN = 2.0 * math.pi
-"""Largest yaw of a sensor, radians; its float32 value is accepted, too."""
+"""Largest yaw of a sensor, radians (`more_than_a_turn`)."""
 
 FARTHEST_MOUNT = 10.0
 """Largest distance of a sensor from the origin of the base frame, metres; 15 for 15 cm is more."""
+
+
+def more_than_a_turn(yaw: float) -> bool:
+    """Return whether a yaw of a sensor, radians, is more than a full turn; that of float32 is none more."""
+    return abs(yaw) > TURN + 1e-6
 
 
 def mount_from(name: str, values: object) -> Pose2:
@@ -36,7 +41,7 @@ def mount_from(name: str, values: object) -> Pose2:
     if len(good) != 3 or len(numbers) != 3:
         raise ParameterError(f'{name}: {values!r} is not [x, y, yaw], three finite numbers (metres, radians)')
     pose = Pose2(*good)
-    if abs(pose.yaw) > TURN + 1e-6:
+    if more_than_a_turn(pose.yaw):
         raise ParameterError(
             f'{name}: a yaw of {pose.yaw:g} is in radians, which is more than a full turn; {pose.yaw:g} degrees are '
             f'{math.radians(pose.yaw):.4f}'

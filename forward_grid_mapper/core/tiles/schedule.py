@@ -4,8 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 
+import numpy as np
+
 from ..common.grid import Grid
-from .tiling import common_part
 
 
 class Schedule:
@@ -18,8 +19,12 @@ class Schedule:
 
     def __init__(self, boxes: Mapping[int, Grid], stale: Iterable[int] | None = None) -> None:
         """Begin with the boxes of all tiles that have readings; by default all of them are stale."""
-        self._boxes = dict(boxes)
-        self.stale = set(self._boxes if stale is None else stale)
+        # as arrays: each search is compared with all boxes, of which a large map has thousands
+        self._numbers = np.fromiter(boxes, np.int64, len(boxes))
+        corners = [(box.column, box.row, box.width, box.height) for box in boxes.values()]
+        self._left, self._bottom, wide, high = np.array(corners, np.int64).reshape(-1, 4).T
+        self._right, self._top = self._left + wide, self._bottom + high
+        self.stale = set(boxes if stale is None else stale)
 
     def stale_of(self, colour: Sequence[int]) -> list[int]:
         """Return the stale tiles of a colour."""
@@ -30,4 +35,7 @@ class Schedule:
         self.stale.discard(number)
         if changed is None:
             return
-        self.stale |= {k for k, box in self._boxes.items() if k != number and common_part(changed, box).size}
+        right, top = changed.column + changed.width, changed.row + changed.height
+        wide = np.minimum(self._right, right) > np.maximum(self._left, changed.column)
+        high = np.minimum(self._top, top) > np.maximum(self._bottom, changed.row)
+        self.stale |= {k for k in self._numbers[wide & high].tolist() if k != number}

@@ -75,7 +75,9 @@ class Tiling:
         self._corner, self._across = (rows[0], columns[0]), len(columns)
         self._up = len(rows)
         self.tiles = tuple(self._tile(row, column) for row in rows for column in columns)
-        self.colours = self._coloured(max(math.ceil(widest / grid.resolution) + 2, self._around))
+        # cells from a window to the end of its box
+        self._beyond = max(math.ceil(widest / grid.resolution) + 2, self._around)
+        self.colours = self._coloured(self._beyond)
 
     def _tile(self, row: int, column: int) -> Tile:
         resolution, edge, m = self.grid.resolution, self._edge, self._margin
@@ -133,6 +135,10 @@ class Tiling:
     def with_windows_in(self, part: Grid) -> list[int]:
         """Return the tiles whose windows overlap a part of the grid."""
         return self._within(part, self._margin)
+
+    def with_boxes_in(self, part: Grid) -> list[int]:
+        """Return the tiles whose boxes may overlap a part of the grid."""
+        return self._within(part, self._margin + self._beyond)
 
     def _within(self, part: Grid, m: int) -> list[int]:
         """Return the tiles whose cores are at most `m` cells away from a part of the grid."""

@@ -49,7 +49,7 @@ DENSITY = 80.0
 
 FEWEST_BLOCKS = 8
 
-FARTHEST = 2.0
+FARTHEST_TOP = 2.0
 """Largest distance of the top of the parabola from the middle, steps."""
 
 LEAST_SIGMA = {'scale': 0.004, 'heading': math.radians(0.3), 'bias': math.radians(0.05), 'turn_scale': 0.003}
@@ -63,7 +63,7 @@ YAW_ERRORS = ('bias', 'turn_scale')
 """The values that `yaw_errors` returns."""
 
 
-class Estimate(NamedTuple):
+class CalibrationEstimate(NamedTuple):
     """A value of the calibration, and its standard deviation."""
 
     value: float
@@ -77,7 +77,7 @@ def determined_calibration(
     calibration: dict[str, float],
     parameters: Parameters,
     stop: NDArray[np.uint8],
-) -> dict[str, Estimate]:
+) -> dict[str, CalibrationEstimate]:
     """Return those values of the calibration that a drive determines, by the names of `CALIBRATION`.
 
     Parameters
@@ -99,11 +99,15 @@ def determined_calibration(
     """
     found = yaw_errors(odometry, trajectory)
     found |= translation_errors(readings, odometry, trajectory, calibration, parameters, stop)
-    stated = {name: Estimate(value, math.hypot(sigma, LEAST_SIGMA[name])) for name, (value, sigma) in found.items()}
+    stated = {
+        name: CalibrationEstimate(value, math.hypot(sigma, LEAST_SIGMA[name])) for name, (value, sigma) in found.items()
+    }
     return {name: stated[name] for name in CALIBRATION if name in stated and stated[name].sigma <= LARGEST_SIGMA[name]}
 
 
-def combined_calibration(first: Mapping[str, float], estimates: Mapping[str, Estimate]) -> dict[str, Estimate]:
+def combined_calibration(
+    first: Mapping[str, float], estimates: Mapping[str, CalibrationEstimate]
+) -> dict[str, CalibrationEstimate]:
     """Return the calibration of raw odometry, if `estimates` are for odometry to which `first` was applied."""
     one = {name: first.get(name, 0.0) for name in CALIBRATION}
     found = {}
@@ -115,11 +119,11 @@ def combined_calibration(first: Mapping[str, float], estimates: Mapping[str, Est
             both = (1 + turns) * one[name] + value * (1 + one['scale'])
         else:
             both = (1 + one[name]) * (1 + value) - 1
-        found[name] = Estimate(both, sigma)
+        found[name] = CalibrationEstimate(both, sigma)
     return found
 
 
-def yaw_errors(odometry: Odometry, trajectory: Odometry) -> dict[str, Estimate]:
+def yaw_errors(odometry: Odometry, trajectory: Odometry) -> dict[str, CalibrationEstimate]:
     """Return `bias` and `turn_scale` by regression of the yaw of a trajectory; empty if the drive is too short."""
     ends = np.arange(0.0, odometry.progress[-1], PIECE)
     if len(ends) <= FEWEST_PIECES:
@@ -141,7 +145,7 @@ def yaw_errors(odometry: Odometry, trajectory: Odometry) -> dict[str, Estimate]:
     # standard errors robust to heteroscedasticity, since wheels slip now and then
     spread = regressors * (residual * math.sqrt(len(residual) / (len(residual) - 2)))[:, None]
     sigma = np.sqrt(np.diag(inverse @ (spread.T @ spread) @ inverse))
-    return {name: Estimate(float(v), float(s)) for name, v, s in zip(YAW_ERRORS, values, sigma, strict=True)}
+    return {name: CalibrationEstimate(float(v), float(s)) for name, v, s in zip(YAW_ERRORS, values, sigma, strict=True)}
 
 
 def translation_errors(
@@ -151,7 +155,7 @@ def translation_errors(
     calibration: dict[str, float],
     parameters: Parameters,
     stop: NDArray[np.uint8],
-) -> dict[str, Estimate]:
+) -> dict[str, CalibrationEstimate]:
     """Return `scale` and `heading` from the likelihood of readings; what they do not determine is left out."""
     parameters = for_matching(parameters)
     every = max(int(len(readings) / max(DENSITY * odometry.travel[-1], 1.0)), 1)
@@ -171,7 +175,7 @@ def translation_errors(
         low, high = (value_at({**start, name: start[name] + sign * step}) for sign in (-1, 1))
         estimate = parabola_top(low, middle, high)
         if estimate is not None:
-            found[name] = Estimate(start[name] + step * estimate.value, step * estimate.sigma)
+            found[name] = CalibrationEstimate(start[name] + step * estimate.value, step * estimate.sigma)
     return found
 
 
@@ -185,10 +189,10 @@ def thinned(readings: Readings, every: int) -> Readings:
     return readings.select(stay)
 
 
-def parabola_top(low: Floats, middle: Floats, high: Floats) -> Estimate | None:
+def parabola_top(low: Floats, middle: Floats, high: Floats) -> CalibrationEstimate | None:
     """Return the top of the parabola through the sums of blocks' values, in steps from the middle.
 
-    None if there is no maximum, or if it is farther than `FARTHEST`.
+    None if there is no maximum, or if it is farther than `FARTHEST_TOP`.
 
     Parameters
     ----------
@@ -204,7 +208,7 @@ def parabola_top(low: Floats, middle: Floats, high: Floats) -> Estimate | None:
     if total >= 0.0:
         return None
     top = -float(slope.sum()) / total
-    if abs(top) > FARTHEST:
+    if abs(top) > FARTHEST_TOP:
         return None
     off = slope + curvature * top
-    return Estimate(top, float(np.sqrt((off**2).sum())) / -total)
+    return CalibrationEstimate(top, float(np.sqrt((off**2).sum())) / -total)

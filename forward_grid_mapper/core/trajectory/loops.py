@@ -44,10 +44,10 @@ SIGMA_FACTOR = np.array([2.0, 2.0, 1.0])
 """Factors of σ of the posterior, for x, y and yaw."""
 
 SIGMAS = 2.5
-LARGEST = np.array([2.5, 2.5, math.radians(20.0)])
+LARGEST_REACH = np.array([2.5, 2.5, math.radians(20.0)])
 """Half the size of the searched area: in σ, and its upper limit, metres and radians."""
 
-LEAST = np.array([0.2, 0.2, math.radians(3.0)])
+LEAST_REACH = np.array([0.2, 0.2, math.radians(3.0)])
 """Its lower limit, metres and radians."""
 
 SHARED = 4
@@ -129,6 +129,9 @@ def candidates(
         Places where it was recognised already.
     """
     places = np.arange(0, len(nodes), SHARED)
+    # farther ones are impossible, and a long drive has thousands of them
+    far = np.hypot(*(nodes[places, :2] - nodes[middle, :2]).T)
+    places = places[(np.abs(progress[places] - progress[middle]) > APART) & (far < REACH + LARGEST_REACH[0])]
     there = nodes[places] + samples[:, places]
     drawn = relative(there, (nodes[middle] + samples[:, middle])[:, None])
     mean = relative(nodes[places], nodes[middle])
@@ -137,8 +140,7 @@ def candidates(
     sigma = np.sqrt((off**2).mean(0))
     far = np.hypot(mean[:, 0], mean[:, 1])
     wide = np.hypot(sigma[:, 0], sigma[:, 1])
-    away = np.abs(progress[places] - progress[middle])
-    possible = (away > APART) & (far < REACH + np.minimum(wide, LARGEST[0]))
+    possible = far < REACH + np.minimum(wide, LARGEST_REACH[0])
     out: list[tuple[int, Floats]] = []
     for k in np.argsort(np.where(possible, far + wide, np.inf))[: possible.sum()]:
         node = int(places[k])
@@ -176,8 +178,8 @@ def find_loop(
     shape = relative(nodes[middle], nodes[block])
     joint = scans.joint(block, shape)
     guess = relative(nodes[place], nodes[middle])
-    reach = np.clip(SIGMAS * sigma, LEAST, LARGEST)
-    found = search(joint, around, guess, np.maximum(sigma, LEAST / 2), reach)
+    reach = np.clip(SIGMAS * sigma, LEAST_REACH, LARGEST_REACH)
+    found = search(joint, around, guess, np.maximum(sigma, LEAST_REACH / 2), reach)
     best = climbed(joint, around, found.best, MEASURED)
     final = measure(joint, around, best, MEASURED)
     count = len(joint.readings)

@@ -39,7 +39,7 @@ MOST_OFF = 4.0
 """Upper limit of the negative log prior of each component, nats: wheels slip."""
 
 STEPS = (0.1, 0.1, math.radians(2.0))
-REACH, SIGMAS, FARTHEST = 0.1, 3.0, 0.5
+REACH, SIGMAS, LARGEST_TURN = 0.1, 3.0, 0.5
 """Half the size of the grid of poses: metres, σ of the yaw, and upper limit of this, radians."""
 
 EVALUATED = 60
@@ -95,7 +95,7 @@ def _off(scans: Scans, nodes: Floats, block: NDArray[np.int64], motion: Floats, 
     length, turn = w.travel[block[-1]] - w.travel[last], w.turn[block[-1]] - w.turn[last]
     away = ALONG[0] + ALONG[1] * length
     sigma = np.array([away, away, math.sqrt(trust.yaw**2 * length + (YAW_OF_TURN * turn) ** 2 + LEAST_YAW**2)])
-    reach = np.array([REACH, REACH, min(SIGMAS * sigma[2], FARTHEST)])
+    reach = np.array([REACH, REACH, min(SIGMAS * sigma[2], LARGEST_TURN)])
     poses = grid_around(np.zeros(3), reach, STEPS)
     joint = scans.joint(block, motion)
     fits = trust.counts * scores(joint, around, poses, max(len(joint.readings) // EVALUATED, 1))

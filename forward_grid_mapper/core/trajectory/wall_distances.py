@@ -31,7 +31,7 @@ FEWEST = 3
 LEAST_TRAVEL = 0.25
 """Metres of progress that these must span: from a single place, a corner cannot be told from a wall."""
 
-FARTHEST = 5.0
+LONGEST_RANGE = 5.0
 """Longest range that is used, metres; longer ones are seldom of a wall."""
 
 PEAKS = 2
@@ -89,7 +89,7 @@ class Distances:
         self._windows, self._nodes = windows, nodes
         self._wall_angle = np.zeros(len(windows)) if wall_angle is None else wall_angle
         readings, first = windows.readings, windows.first
-        self._usable = readings.echo & (readings.z < FARTHEST) & ~np.repeat(held_out, np.diff(first))
+        self._usable = readings.echo & (readings.z < LONGEST_RANGE) & ~np.repeat(held_out, np.diff(first))
         self._looks_past = not (np.abs(wrapped(windows.mount[:, 2])) <= readings.half_angle).any()
         self._beside = beside(windows.mount[:, 2], readings.half_angle)
         rows = [row for k in range(0, len(windows), BLOCK) for row in self._measured(k)]

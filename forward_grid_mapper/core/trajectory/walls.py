@@ -50,7 +50,7 @@ BIN = 0.06
 
 BINS = 400
 
-FARTHEST = 3.5
+LONGEST_VOTE = 3.5
 """Longest range of an echo that votes, metres: farther away, too many objects are in the cone."""
 
 FEWEST = 9
@@ -120,7 +120,7 @@ def count_votes(echoes: Any, counts: Any, votes: Any) -> None:
                     counts[k, 1] += weight * along
                     counts[k, 2] += weight * along * along
                     counts[k, 3] += weight * thing
-        total, even = 0.0, heard * BIN / FARTHEST
+        total, even = 0.0, heard * BIN / LONGEST_VOTE
         chance = even + CHANCE * math.sqrt(even)
         for k in range(BINS):
             count = counts[k, 0]
@@ -180,7 +180,7 @@ def wall_votes(windows: Windows, held_out: NDArray[np.bool_]) -> tuple[NDArray[n
     at = np.flatnonzero(np.diff(steps, prepend=-1.0) > 0)
     votes, counts = np.zeros((len(at), DIRECTIONS)), np.empty((BINS, 4))
     r = w.readings
-    usable = r.echo & (r.z < FARTHEST) & ~np.repeat(held_out, np.diff(w.first))
+    usable = r.echo & (r.z < LONGEST_VOTE) & ~np.repeat(held_out, np.diff(w.first))
     past = beside(w.mount[:, 2], r.half_angle)
     for k, node in enumerate(at):
         near = np.abs(w.node_progress - w.node_progress[node]) <= SPAN / 2

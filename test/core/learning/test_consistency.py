@@ -7,6 +7,7 @@ import math
 import re
 import sys
 import time
+import tracemalloc
 from collections.abc import Callable, Iterator
 from functools import lru_cache
 from pathlib import Path
@@ -25,6 +26,7 @@ from forward_grid_mapper.core.messages.message_types import NANOSECONDS, Odometr
 from forward_grid_mapper.files.quality_warning import quality_warning
 from forward_grid_mapper.simulation.drive import Recording, building_drive, corridor_drive, door_drive, drive
 from forward_grid_mapper.simulation.sonar import NOISE_FREE, NOISY, front_array, sonar_ring
+from forward_grid_mapper.simulation.world import rooms_world
 from samples import associated
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[3] / 'benchmarks'))
@@ -383,3 +385,28 @@ def test_random_ranges_of_all_sensors_give_a_quality_warning() -> None:
     maps = Mapper(Parameters()).run(random)
     assert re.search(r'of \d+ readings are most likely random.*poses of the sensors, odometry', quality_warning(maps))
     assert not quality_warning(Mapper(Parameters()).run(r))
+
+
+@pytest.mark.parametrize('yaw', [0.0, 57.3])
+def test_constant_yaw_of_a_straight_drive_is_not_called_a_turn(yaw: float) -> None:
+    """Odometry without an orientation, and one in degrees: 57.3° are 1 rad."""
+    made = drive(rooms_world(), np.array([[1.5, 3.45], [10.5, 3.45]]), 0.05, front_array(), NOISY, seed=2)
+    straight = Messages(dict(made.extrinsics), list(made.odometry), list(made.ranges)).driven(Pose2(0, 0, 1.0).compose)
+    assert not warnings_of(straight)
+    (warning,) = warnings_of(straight.driven(lambda p: Pose2(p.x, p.y, yaw)))
+    assert f'always {yaw:.2f} rad, but the robot drives in the direction 1.0' in warning, warning
+    assert 'leave out the orientation, or is the yaw in degrees' in warning
+
+
+def test_directions_of_travel_of_odometry_that_jumps_need_little_memory() -> None:
+    k = np.arange(20_000)
+    readings = Readings.from_columns(
+        ('a',), x=50.0 * (k % 2), y=0.001 * k, yaw=0.0, z=np.ones(len(k)), z_max=3.0, half_angle=0.1, stamp=k
+    )
+    made = MountedReadings.of(readings, {'a': Pose2(0.0, 0.0, 0.0)})
+    tracemalloc.start()
+    at, directions = made.travel()
+    most = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert len(at) == len(directions) == len(k) - 2
+    assert most < 2000 * len(k) / 10

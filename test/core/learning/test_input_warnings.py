@@ -266,6 +266,13 @@ def test_wrong_input_gives_one_warning_with_the_cause(name: str) -> None:
     assert len(warnings) == 1, f'one cause, one warning: {warnings}'
 
 
+def test_limits_in_the_wrong_order_are_no_question_of_units() -> None:
+    """The readings are rejected as bad_limits, which is said elsewhere."""
+    swapped = drive().with_ranges(lambda m: m._replace(min_range=m.max_range, max_range=m.min_range))
+    associator = associated(*swapped)
+    assert set(associator.rejected) == {'bad_limits'} and associator.message_warnings() == []
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize('noise', [NOISY, NOISE_FREE])
 @pytest.mark.parametrize('sonars', [front_array, sonar_ring])

@@ -141,6 +141,15 @@ def test_something_beside_a_parked_robot_is_no_fault(broken_too: bool) -> None:
     assert [name for name, row in table.items() if row.suspect] == (['sonar_04'] if broken_too else [])
 
 
+def test_places_do_not_depend_on_whole_turns_of_the_yaw() -> None:
+    maps = mapped(rooms())
+    turns = np.random.default_rng(0).integers(-3, 4, len(maps.readings))
+    turned = dataclasses.replace(maps.readings, yaw=maps.readings.yaw + 2 * math.pi * turns)
+    one, other = (health_counts(r, maps.forward_model(), maps.ml, maps.unexplained) for r in (maps.readings, turned))
+    # the yaw of a few readings is rounded to the other side of a border
+    np.testing.assert_allclose(other['places'], one['places'], atol=2)
+
+
 @pytest.mark.parametrize('heading', [0.0, 0.2, 0.4, 2.0])
 def test_sensors_beside_smooth_walls_are_not_short(heading: float) -> None:
     """They hear the walls of a corridor at one range all the time; those that look ahead never do."""

@@ -9,9 +9,12 @@ import numpy as np
 import pytest
 from line_world import LINE, TRUTH, drawn, line_map
 
+from forward_grid_mapper.core.common.grid import Grid
 from forward_grid_mapper.core.common.parameter_groups import ModelParameters
+from forward_grid_mapper.core.common.parameters import find
 from forward_grid_mapper.core.common.readings import Readings
 from forward_grid_mapper.core.joint_learning import settle
+from forward_grid_mapper.core.learning.model_update import learn
 from forward_grid_mapper.core.learning.standard_errors import (
     LEARNED,
     ParameterEstimate,
@@ -107,3 +110,27 @@ def test_values_that_cannot_be_learned_have_a_reason() -> None:
     assert nothing['p_hit'].bound == nothing['sigma'].bound == 'no reading informs it'
     stated = dataclasses.replace(readings, sigma=np.full(len(readings), 0.05))
     assert parameter_estimates(ForwardModel(stated, LINE, START), line_map())['sigma'].readings == 0
+
+
+def test_p_hit_of_a_large_cell_that_every_reading_hears_has_no_error() -> None:
+    rng = np.random.default_rng(10)
+    cells = Grid(0.5, 0, 0, 12, 1)
+    wall = np.zeros(cells.shape, np.int8)
+    wall[0, 5] = 1
+    z = 2.35 + 0.1 * rng.standard_normal(400)
+    readings = Readings.from_columns(
+        ('sonar',), x=0.25, y=0.25, yaw=0.0, z=z, z_max=5.0, half_angle=0.005, stamp=np.arange(400)
+    )
+    forward = ForwardModel(readings, cells, dataclasses.replace(START, p_rand=0.05, p_lost=0.0, sigma=0.3))
+    found = parameter_estimates(forward.at(settle(forward, wall)), wall)['p_hit']
+    assert math.isnan(found.error) and found.bound == 'that of a cell lies at its largest value, 0.98'
+
+
+def test_learned_values_stay_in_the_range_of_parameter_files() -> None:
+    silent = Readings.from_columns(
+        ('sonar',), x=0.0, y=0.05, yaw=0.0, z=[6.0] * 9, z_max=6.0, half_angle=0.005, stamp=np.arange(9)
+    )
+    model = dataclasses.replace(START, p_rand=1e-4, p_lost=0.9)
+    for _ in range(50):
+        model = learn(ForwardModel(silent, LINE, model), np.zeros(LINE.shape, np.int8))
+    assert model.p_rand >= find('p_rand').low and model.p_rand + model.p_lost == pytest.approx(0.9)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import time
+
 import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -48,6 +50,15 @@ def test_unlikely_obstacles_are_those_of_the_twin(seed: int) -> None:
     assert set(map(tuple, np.argwhere(found).tolist())) == unlikely_by_flooding(ml, probability)
     for turned in (np.flipud, np.fliplr, np.transpose):
         assert np.array_equal(unlikely_obstacles(turned(ml), turned(probability)), turned(found))
+
+
+def test_long_unlikely_wall_takes_no_time() -> None:
+    ml, probability = np.zeros((2, 1500, 1500))
+    ml[700, 5:-5] = 1.0
+    probability[700, 5] = 1.0
+    begun = time.process_time()
+    assert not unlikely_obstacles(ml.astype(np.int8), probability.astype(np.float32)).any()
+    assert time.process_time() - begun < 1.0, 'the whole map is gone through for each cell of the wall'
 
 
 def test_unlikely_obstacle_is_removed() -> None:

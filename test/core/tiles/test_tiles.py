@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import math
 import pickle
+import time
 from concurrent.futures import ThreadPoolExecutor
 from functools import lru_cache, partial
 from typing import Any
@@ -29,6 +30,7 @@ from forward_grid_mapper.core.search.search import LEAST_GAIN, ROUNDING, Search
 from forward_grid_mapper.core.tiled_mapping import TiledMapper
 from forward_grid_mapper.core.tiles import tile_steps
 from forward_grid_mapper.core.tiles.mosaic import Mosaic
+from forward_grid_mapper.core.tiles.schedule import Schedule
 from forward_grid_mapper.core.tiles.tiling import Tiling, boxes_of, common_part, widest_of
 from forward_grid_mapper.simulation.drive import corridor_drive, drive
 from forward_grid_mapper.simulation.sonar import NOISY, front_array
@@ -87,6 +89,10 @@ def test_tile_has_all_readings_that_touch_its_window(seed: int, size: float) -> 
             assert set(near) <= set(tiling.with_windows_in(part) if window else tiling.with_cores_in(part)), (
                 'a tile that lies there is missing'
             )
+        box = tiling.box(number, readings.select(found[number]), p)
+        for k, other in enumerate(tiling.tiles):
+            if common_part(other.core, box).size:
+                assert number in tiling.with_boxes_in(other.core), f'the box of {number} overlaps the core of {k}'
     for tile, indices in zip(tiling.tiles, found, strict=True):
         rows, columns = grid.window(tile.window)
         inside = {
@@ -103,6 +109,25 @@ def test_tile_has_all_readings_that_touch_its_window(seed: int, size: float) -> 
         of_colour = np.concatenate([found[number] for number in colour])
         assert len(of_colour) == len(set(of_colour.tolist())), 'two tiles of one colour share a reading'
     assert sorted(number for colour in tiling.colours for number in colour) == list(range(len(tiling.tiles)))
+
+
+def test_boxes_of_far_tiles_are_not_searched() -> None:
+    tiling = Tiling(Grid(0.1, 0, 0, 4000, 4000), 10.0, 5.0)
+    near = tiling.with_boxes_in(tiling.tiles[len(tiling.tiles) // 2 + 20].core)
+    assert len(near) == 9
+
+
+def test_schedule_of_many_tiles_takes_no_time() -> None:
+    across = range(-30, 30)
+    boxes = {60 * r + c + 2000: Grid(0.1, 100 * c - 30, 100 * r - 30, 160, 160) for r in across for c in across}
+    schedule, begun = Schedule(boxes), time.process_time()
+    for number, box in boxes.items():
+        schedule.searched(number, box)
+    assert time.process_time() - begun < 5.0, 'the whole map is gone through for each box, one by one'
+    schedule = Schedule(boxes, ())
+    changed = Grid(0.1, -40, 71, 10, 5)
+    schedule.searched(7, changed)
+    assert schedule.stale == {k for k, box in boxes.items() if common_part(box, changed).size} != set()
 
 
 # ---- windows

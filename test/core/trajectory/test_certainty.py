@@ -9,7 +9,7 @@ import pytest
 
 from forward_grid_mapper.core.common.parameters import Parameters
 from forward_grid_mapper.core.trajectory.certainty import (
-    Estimate,
+    CalibrationEstimate,
     combined_calibration,
     determined_calibration,
     parabola_top,
@@ -107,7 +107,10 @@ def test_only_certain_values_are_returned(tour: Recording) -> None:
 def test_two_calibrations_are_combined_to_one(tour: Recording) -> None:
     odometry = odometry_of(tour)
     one = dict(zip(CALIBRATION, (0.03, 0.01, 0.02, -0.03), strict=True))
-    other = {name: Estimate(value, 0.001) for name, value in zip(CALIBRATION, (-0.01, 0.02, -0.01, 0.02), strict=True)}
+    other = {
+        name: CalibrationEstimate(value, 0.001)
+        for name, value in zip(CALIBRATION, (-0.01, 0.02, -0.01, 0.02), strict=True)
+    }
     both = combined_calibration(one, other)
     there = calibrated(calibrated(odometry, vector(**one)), vector(**{k: v.value for k, v in other.items()}))
     at_once = calibrated(odometry, vector(**{k: v.value for k, v in both.items()}))

@@ -19,7 +19,7 @@ from forward_grid_mapper.core.trajectory.walls import (
     CHANCE,
     COUNTS,
     DIRECTIONS,
-    FARTHEST,
+    LONGEST_VOTE,
     POINT,
     THING,
     beside,
@@ -71,7 +71,7 @@ def test_votes_are_those_of_the_twin() -> None:
                 row = (math.cos(angle) * y - math.sin(angle) * x, (half * z) ** 2 / 3 + THING)
                 bins.setdefault(below, []).append((vote * (1 - (at - below)), *row))
                 bins.setdefault(below + 1, []).append((vote * (at - below), *row))
-                even += vote * BIN / FARTHEST
+                even += vote * BIN / LONGEST_VOTE
         for rows in bins.values():
             weight, along, point = np.array(rows).T
             n = weight.sum()

@@ -174,3 +174,14 @@ def test_known_loops_are_not_searched_again(solver, monkeypatch) -> None:
     searched.clear()
     assert find_loops(scans, true, samples, usual, lambda part: None, known) == known
     assert not searched
+
+
+def test_only_near_places_are_examined(monkeypatch: pytest.MonkeyPatch) -> None:
+    k = np.arange(4000)
+    there_and_back = 0.4 * np.minimum(k, 4000 - k)
+    nodes = np.stack([there_and_back, 0.0 * k, np.where(k < 2000, 0.0, math.pi)], axis=1)
+    examined = []
+    monkeypatch.setattr(loops, 'relative', lambda frame, pose: examined.append(frame.size) or relative(frame, pose))
+    samples = np.random.default_rng(0).normal(0.0, 0.1, (20, *nodes.shape))
+    ((place, _),) = loops.candidates(nodes, samples, 0.4 * k, 3000)
+    assert place == 1000 and sum(examined) < 0.05 * samples.size / loops.SHARED

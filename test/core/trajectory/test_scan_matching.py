@@ -90,7 +90,7 @@ def test_mean_of_poses_is_that_of_the_twin(scans, matched) -> None:
     near, far = scan_matching.ALONG
     yaw = math.sqrt(TRUST.yaw**2 * length + (scan_matching.YAW_OF_TURN * turn) ** 2 + scan_matching.LEAST_YAW**2)
     sigmas = (near + far * length, near + far * length, yaw)
-    each, steps = [], range(-int(min(3.0 * yaw, scan_matching.FARTHEST) / math.radians(2.0)), 0)
+    each, steps = [], range(-int(min(3.0 * yaw, scan_matching.LARGEST_TURN) / math.radians(2.0)), 0)
     turns = [math.radians(2.0) * n for n in (*steps, 0, *(-n for n in reversed(steps)))]
     for x in (-0.1, 0.0, 0.1):
         for y in (-0.1, 0.0, 0.1):
