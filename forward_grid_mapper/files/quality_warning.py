@@ -81,7 +81,7 @@ def without_echoes(readings: Readings) -> Iterator[str]:
 def quality_warning(maps: MapSet, warned: bool = False) -> str:
     """Return the reason why the maps should not be trusted; '' if there is none.
 
-    `warned` is whether there are warnings before this one, which may name the cause.
+    `warned` is whether there are other warnings, which may name the cause.
     """
     count, unexplained = len(maps.readings), int(np.count_nonzero(maps.unexplained))
     if count < LEAST_READINGS or unexplained <= MANY_UNEXPLAINED * count:
@@ -94,7 +94,7 @@ def quality_warning(maps: MapSet, warned: bool = False) -> str:
     )
     return (
         f'{unexplained} of {count} readings are most likely random measurements: the map does not fit the readings; '
-        f'{"if the warnings before this one do not say why: " if warned else ""}{cause}'
+        f'{"if no other warning says why: " if warned else ""}{cause}'
     )
 
 

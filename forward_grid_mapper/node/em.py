@@ -249,13 +249,13 @@ class EmWorker:
         self._conclude(conclude)
 
 
-def summary(maps: MapSet, seconds: float) -> str:
-    """Return the result of a run in one line."""
+def summary(maps: MapSet, seconds: float, warned: bool = False) -> str:
+    """Return the result of a run in one line; `warned` is whether there are warnings beside it."""
     s = maps.statistics
     return (
         f'{counted(len(maps.readings), "reading")}, {s["occupied"]} occupied cells, {seconds:.2f} seconds '
         f'({s["iterations"]} iterations, {s["flips"]} flips, {s["shifts"]} shifts, '
         f'log-likelihood {maps.log_likelihood:.1f}, objective {maps.objective:.1f})'
         + ('' if s['converged'] else '; NOT converged: raise max_iterations')
-        + (f'; WARNING: {warning}' if (warning := quality_warning(maps)) else '')
+        + (f'; WARNING: {warning}' if (warning := quality_warning(maps, warned)) else '')
     )

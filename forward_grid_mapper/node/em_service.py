@@ -125,9 +125,10 @@ class EmService:
                 spent = time.monotonic() - begin
                 waited = min(outcome.waited, spent)
                 compiled = f'after {waited:.0f} s of compiling kernels, as at the first start'
-                said = [summary(outcome.maps, spent - waited), compiled if waited >= LONG_WAIT else '']
                 # the log and /diagnostics have named rejected readings before
                 warnings = [*outcome.warnings, *self._associator.rejection_warnings()]
+                result = summary(outcome.maps, spent - waited, bool(warnings))
+                said = [result, compiled if waited >= LONG_WAIT else '']
                 warned = [f'WARNING: {warning}' for warning in warnings]
                 reply.send(True, '; '.join(filter(None, [*said, outcome.trajectory, *warned])))
 
@@ -319,7 +320,8 @@ class EmService:
         for warning in filter(None, [*outcome.warnings, quality_warning(maps, bool(outcome.warnings))]):
             self._logger.warning(f'EM: {warning}')
         outcome.trajectory = self._trajectory.outcome()
-        said = filter(None, [summary(maps, sum(maps.statistics['seconds'].values())), outcome.trajectory])
+        spent = sum(maps.statistics['seconds'].values())
+        said = filter(None, [summary(maps, spent, bool(outcome.warnings)), outcome.trajectory])
         self.last_run = '; '.join(said)
         self._logger.info(f'EM: {self.last_run}')
         # callers of EM are answered before this

@@ -55,7 +55,7 @@ def test_map_that_does_not_fit_refers_to_the_causes_before() -> None:
     )
     *causes, last = data_warnings(Mapper(Parameters()).run(shared), {})
     assert len(causes) == 1 and 'do all sensors have the same frame_id' in causes[0]
-    assert 'if the warnings before this one do not say why: are the poses of the sensors' in last
+    assert 'if no other warning says why: are the poses of the sensors' in last
 
 
 def test_odometry_that_has_only_velocities_is_named_if_the_map_does_not_fit() -> None:

@@ -248,7 +248,7 @@ def test_summary_of_a_run_is_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
     statistics = {'iterations': 7, 'flips': 8, 'shifts': 9, 'occupied': 10, 'converged': True}
     maps: Any = SimpleNamespace(statistics=statistics, readings=range(5), log_likelihood=-1.25, objective=-2.5)
     warnings: list[str] = []
-    monkeypatch.setattr(em, 'quality_warning', lambda maps: ''.join(warnings))
+    monkeypatch.setattr(em, 'quality_warning', lambda maps, warned: ''.join(warnings) + '; see above' * warned)
     line = (
         '5 readings, 10 occupied cells, 3.21 seconds '
         '(7 iterations, 8 flips, 9 shifts, log-likelihood -1.2, objective -2.5)'
@@ -258,6 +258,7 @@ def test_summary_of_a_run_is_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
     assert em.summary(maps, 3.21) == f'{line}; NOT converged: raise max_iterations'
     warnings.append('it does not fit')
     assert em.summary(maps, 3.21) == f'{line}; NOT converged: raise max_iterations; WARNING: it does not fit'
+    assert em.summary(maps, 3.21, True).endswith('WARNING: it does not fit; see above')
 
 
 @pytest.mark.parametrize(('threads', 'expected'), [(0, 6), (2, 2)])
