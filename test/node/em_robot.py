@@ -134,9 +134,9 @@ class EmRobot:
         monkeypatch.setattr(em, 'map_grid', lambda readings, parameters: GRID)
         monkeypatch.setattr(em, 'sensor_health', lambda maps: {'sonar': 'health'})
         monkeypatch.setattr(em, 'input_warnings', lambda readings: list(self.warnings))
-        monkeypatch.setattr(em_service, 'quality_warning', lambda maps: '')
+        monkeypatch.setattr(em_service, 'quality_warning', lambda maps, warned: '')
         monkeypatch.setattr(
-            em_service, 'summary', lambda maps, seconds: f'{len(maps.readings)} readings in {seconds:.2f} s'
+            em_service, 'summary', lambda maps, seconds, warned: f'{len(maps.readings)} readings in {seconds:.2f} s'
         )
         self.checked: list[tuple[int, Any]] = []
         monkeypatch.setattr(consistency_check, 'consistency_warnings', self._check)
