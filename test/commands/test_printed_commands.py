@@ -76,7 +76,8 @@ def test_learn_prints_a_command_that_maps_the_same_readings(
         sonar_topic=lambda m: f'/sonars/{m.frame_id}',
     )
     topics = [f'/sonars/{frame}' for frame in frames]
-    arguments = ('--rounds', 1, f'--output={name}.yaml', '--odom-topic', '/odom', '--range-topics', *topics)
+    written = '--keep-going', f'--output={name}.yaml'
+    arguments = ('--rounds', 1, *written, '--odom-topic', '/odom', '--range-topics', *topics)
     assert code_of(learn.main, f'./{bag}', *arguments) == 0
     out = capsys.readouterr().out
     ((command, *words),) = commands_in(out)

@@ -28,14 +28,14 @@ from .any_angle import match_drive
 from .attempt import ACCURACY, EXACT, Attempt, Drive, gain_words, refined
 from .certainty import LARGEST_SIGMA, yaw_errors
 from .holding_out import LEAST_SIGMAS, Gain, has_revisits, held_out
-from .judging import gain_at_revisits, gain_of_objective
+from .judging import gain_at_revisits, gain_of_objective, gain_within_visits
 from .jumps import MOST_JUMPS, jumps, without_outliers
 from .local_map import for_matching
 from .odometry_model import CALIBRATION
 from .outcome import Differences, Refinement, differences, joined_parts, replaced, with_all_poses, with_outliers
 from .passes import BLOCK
 from .refinable import unfit, without_times
-from .relocating import LEAST_RECOGNISED
+from .relocating import LEAST_RECOGNISED, confirmed_by_places
 from .right_angles import at_right_angles
 from .scans import Scans
 from .standing import without_stands
@@ -153,6 +153,10 @@ class Refiner:
         better = gain_at_revisits(scans, windows.node, nodes, self._start_stage('judgement'))
         if better.sigmas < LEAST_SIGMAS:
             return _without_better(by_walls.refinement)
+        if not confirmed_by_places(scans, nodes, found.loops):
+            within = gain_within_visits(scans, windows.node, nodes, self._start_stage('judgement'))
+            if within.sigmas < LEAST_SIGMAS:
+                return _without_better(by_walls.refinement, unconfirmed_words(found.part))
         if known is None and (walls := self._by_walls_after_all(drive, by_walls, nodes, least)) is not None:
             return walls
         at_revisits = 'where the robot came back, ' if has_revisits(scans, nodes) else ''
@@ -187,6 +191,9 @@ class Refiner:
             noise = self._parameters.association.odometry_noise
             by_walls = at_right_angles(drive, noise, least, self._start_stage, odometry_is_wrong=True)
         if by_walls is None or not by_walls.refinement.accepted:
+            return None
+        if has_revisits(drive.scans, nodes) and not has_revisits(drive.scans, by_walls.nodes):
+            # it would be better in both comparisons, because it contradicts itself nowhere
             return None
         for compared in (gain_at_revisits, gain_of_objective):
             try:
@@ -226,6 +233,19 @@ def near_words(moved: float) -> str:
     return (
         f'; scan matching alone moves odometry by {moved:.2f} m (root mean square), which is not more than the '
         'accuracy of sonar'
+    )
+
+
+def unconfirmed_words(part: float) -> str:
+    """Return why matching alone is not used if this part of the blocks on its earlier visits is recognised."""
+    recognised = (
+        f'only {part:.0%} of the path through places seen before is'
+        if part < LEAST_RECOGNISED
+        else ('hardly any of the places to which the robot came back by odometry are')
+    )
+    return (
+        f'; with scan matching alone, {recognised} recognised, and within a few metres it does not predict readings '
+        'clearly better than odometry'
     )
 
 

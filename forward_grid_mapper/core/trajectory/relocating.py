@@ -96,6 +96,17 @@ def recognised_part(scans: Scans, nodes: Floats, loops: Sequence[Loop]) -> float
     return len(recognised(loops).intersection(blocks)) / len(blocks) if blocks else 1.0
 
 
+def confirmed_by_places(scans: Scans, nodes: Floats, loops: Sequence[Loop]) -> bool:
+    """Return whether places seen before confirm a trajectory: nearly all blocks on an earlier visit are recognised.
+
+    These are half as many as by odometry, or more: a trajectory that comes back to no place has none to be recognised.
+    True if neither comes back to a place.
+    """
+    if 2 * len(recognised(loops)) < len(revisits(scans, scans.windows.node)):
+        return False
+    return recognised_part(scans, nodes, loops) >= LEAST_RECOGNISED
+
+
 def unsupported(blocks: NDArray[np.int64], seen: set[int], begin: int) -> NDArray[np.int64] | None:
     """Return the first stretch from block `begin` on of which hardly any block is recognised; None if there is none.
 

@@ -227,10 +227,12 @@ def _at_revisits(drive: Drive, walls: _AlongWalls, nodes: Floats, watch: Progres
     """Judge refined nodes where the robot came back, or by votes of walls if it did not.
 
     Revisits show drift over the whole drive, and walls that are not parallel. Whether the robot came back is decided
-    along the refined nodes, since by odometry it may be wrong.
+    along the refined nodes, since by odometry it may be wrong. But votes do not suffice for walls along which it comes
+    back nowhere if it does by odometry: a corridor around a hall is not straight because its walls can be taken for
+    straight ones.
     """
     revisited = has_revisits(drive.scans, nodes)
-    if not revisited and not walls.votes_suffice:
+    if not revisited and (not walls.votes_suffice or has_revisits(drive.scans, drive.windows.node)):
         return walls.verdict
     better = gain_at_revisits(drive.scans, drive.windows.node, nodes, watch)
     words = gain_words(better)

@@ -163,6 +163,7 @@ def test_walls_are_tried_again_once_matching_shows_that_odometry_is_wrong(
 
     monkeypatch.setattr(refinement, 'at_right_angles', at_right_angles)
     monkeypatch.setattr(refinement, 'match_drive', matched)
+    monkeypatch.setattr(refinement, 'confirmed_by_places', lambda *rest: True)
     # first that over odometry, then that over walls
     gains = iter((1.0, held_out_gain))
     monkeypatch.setattr(refinement, 'gain_at_revisits', lambda *rest: Gain(next(gains), 0.1))
@@ -170,6 +171,50 @@ def test_walls_are_tried_again_once_matching_shows_that_odometry_is_wrong(
     found = Refiner(Parameters()).run(readings, odometry)
     assert asked == [False, True] and found.accepted
     assert found.reason.startswith('walls; scan matching alone shows' if by_walls else 'walls are not assumed')
+
+
+@pytest.mark.parametrize(('part', 'within', 'accepted'), [(1.0, 0.1, False), (0.5, 0.2, False), (0.5, 0.3, True)])
+def test_matching_that_places_do_not_confirm_must_be_better_within_a_few_metres(
+    bent, monkeypatch, part: float, within: float, accepted: bool
+) -> None:
+    readings, odometry = bent
+
+    def at_right_angles(drive: Drive, *rest, **options) -> Attempt:
+        return Attempt(Refinement(False, 'no walls', readings, odometry, {}), drive.windows.node)
+
+    def matched(odometry: Odometry, scans: Scans, *rest) -> MatchedDrive:
+        return MatchedDrive(scans.windows.node * (1.1, 1.0, 1.0), [], 0.0, part)
+
+    monkeypatch.setattr(refinement, 'at_right_angles', at_right_angles)
+    monkeypatch.setattr(refinement, 'match_drive', matched)
+    monkeypatch.setattr(refinement, 'gain_at_revisits', lambda *rest: Gain(1.0, 0.1))
+    monkeypatch.setattr(refinement, 'confirmed_by_places', lambda *rest: False)
+    monkeypatch.setattr(refinement, 'gain_within_visits', lambda *rest: Gain(within, 0.1))
+    found = Refiner(Parameters()).run(readings, odometry)
+    assert found.accepted == accepted
+    expected = (
+        'only 50% of the path through places seen before is' if part < 1.0 else 'hardly any of the places to which'
+    )
+    assert accepted or expected in found.reason
+
+
+def test_walls_that_tear_apart_what_matching_brings_together_are_not_taken(bent, monkeypatch) -> None:
+    readings, odometry = bent
+
+    def at_right_angles(drive: Drive, *rest, odometry_is_wrong: bool = False) -> Attempt:
+        outcome = Refinement(odometry_is_wrong, 'walls', readings, odometry, {})
+        return Attempt(outcome, drive.windows.node * (50.0, 1.0, 1.0), before_matching=True)
+
+    def matched(odometry: Odometry, scans: Scans, *rest) -> MatchedDrive:
+        return MatchedDrive(scans.windows.node * (1.1, 1.0, 1.0), [], 0.0, 1.0)
+
+    monkeypatch.setattr(refinement, 'at_right_angles', at_right_angles)
+    monkeypatch.setattr(refinement, 'match_drive', matched)
+    monkeypatch.setattr(refinement, 'confirmed_by_places', lambda *rest: True)
+    monkeypatch.setattr(refinement, 'has_revisits', lambda scans, nodes: bool(np.ptp(nodes[:, 0]) < 100.0))
+    monkeypatch.setattr(refinement, 'gain_at_revisits', lambda *rest: Gain(1.0, 0.1))
+    monkeypatch.setattr(refinement, 'gain_of_objective', lambda *rest: Gain(0.0, 0.1))
+    assert Refiner(Parameters()).run(readings, odometry).reason.startswith('walls are not assumed')
 
 
 @pytest.mark.parametrize(('by_votes', 'gain', 'accepted'), [(True, 0.2, False), (True, 0.3, True), (False, 0.2, True)])
@@ -215,6 +260,10 @@ def test_walls_are_no_proof_if_recognised_places_do_not_confirm(bent, monkeypatc
     worse = Refiner(Parameters()).run(*bent)
     assert not worse.accepted
     assert worse.reason.startswith('readings are predicted worse than')
+    # nor are they if the robot came back by odometry, but would not along walls
+    monkeypatch.setattr(right_angles, 'gain_at_revisits', lambda *rest: Gain(1.0, 0.01))
+    monkeypatch.setattr(right_angles, 'has_revisits', lambda scans, nodes: nodes is scans.windows.node)
+    assert not Refiner(Parameters()).run(*bent).accepted
 
 
 @pytest.mark.parametrize(

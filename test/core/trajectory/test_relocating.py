@@ -13,8 +13,9 @@ from exact_tour import Tour, quietly, tour_with
 from forward_grid_mapper.core.common.readings import Floats
 from forward_grid_mapper.core.trajectory import hypotheses, solving
 from forward_grid_mapper.core.trajectory.heading import DOUBTFUL, Heading, doubts, slight
-from forward_grid_mapper.core.trajectory.holding_out import Gain
+from forward_grid_mapper.core.trajectory.holding_out import LEAST_SIGMAS, Gain
 from forward_grid_mapper.core.trajectory.hypotheses import MOST_DOUBTFUL, solve_hypotheses
+from forward_grid_mapper.core.trajectory.judging import gain_at_revisits, gain_within_visits
 from forward_grid_mapper.core.trajectory.loops import APART, LENGTH, Loop
 from forward_grid_mapper.core.trajectory.matching import Match
 from forward_grid_mapper.core.trajectory.passes import Matches, match_preceding
@@ -23,8 +24,10 @@ from forward_grid_mapper.core.trajectory.poses import compose, relative
 from forward_grid_mapper.core.trajectory.relocating import (
     CONFIRMING,
     FEW,
+    LEAST_RECOGNISED,
     RUN,
     confirmed,
+    confirmed_by_places,
     displaced,
     recognised,
     revisits,
@@ -73,6 +76,39 @@ def test_long_part_is_found_farther_away_than_single_blocks(there_and_back) -> N
     rest = np.setdiff1d(np.arange(len(true)), stretch)
     np.testing.assert_array_equal(moved[rest], astray(there_and_back)[rest])
     assert displaced(scans, true, stretch) is None
+
+
+def torn(tour: Tour) -> Floats:
+    """Return the nodes with the way back far from the way there."""
+    return tour.windows.node + (np.arange(len(tour.windows)) >= turning(tour))[:, None] * (60.0, 0.0, 0.0)
+
+
+def test_trajectory_is_confirmed_by_the_places_to_which_it_comes_back(there_and_back) -> None:
+    scans, true = there_and_back.scans, there_and_back.windows.node
+    blocks = revisits(scans, true).tolist()
+    nowhere_again = np.arange(len(true))[:, None] * (5.0, 0.0, 0.0)
+    assert len(blocks) > 5 and not len(revisits(scans, nowhere_again))
+    most = math.ceil(LEAST_RECOGNISED * len(blocks))
+    assert confirmed_by_places(scans, true, found_at(there_and_back, blocks[:most], 0))
+    assert not confirmed_by_places(scans, true, found_at(there_and_back, blocks[: most - 1], 0))
+    # by odometry, it comes back to many places
+    assert not confirmed_by_places(scans, nowhere_again, [])
+    assert not confirmed_by_places(scans, nowhere_again, found_at(there_and_back, blocks[:1], 0))
+
+
+def test_trajectory_of_a_drive_without_revisits_needs_no_places() -> None:
+    tour = tour_with(sonar_ring(16), building_tour()[:4])
+    assert not len(revisits(tour.scans, tour.windows.node))
+    assert confirmed_by_places(tour.scans, tour.windows.node, [])
+
+
+def test_torn_trajectory_is_better_on_maps_of_all_visits_only(there_and_back) -> None:
+    scans, true = there_and_back.scans, there_and_back.windows.node
+    # the two visits contradict each other a little, but the torn trajectory is much worse
+    drifting = true + (np.arange(len(true)) >= turning(there_and_back))[:, None] * (0.0, 0.6, 0.0)
+    assert gain_at_revisits(scans, drifting, torn(there_and_back)).sigmas > LEAST_SIGMAS
+    within = gain_within_visits(scans, drifting, torn(there_and_back))
+    assert np.isfinite(within.error) and abs(within.sigmas) < LEAST_SIGMAS
 
 
 @pytest.mark.slow
