@@ -131,7 +131,7 @@ def halves_warning(contradiction: float | None, remedy: str) -> str:
     corrects = f'{remedy} corrects this' if remedy else 'no better trajectory was found'
     return (
         'the two halves of the drive contradict each other, so that walls may be bent or doubled: odometry drifts or '
-        f'jumps ({corrects}), the robot was carried, or many people or things moved'
+        f'jumps ({corrects}), the robot was carried, many people or things moved, or another warning names the cause'
     )
 
 
