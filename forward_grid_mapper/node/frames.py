@@ -146,9 +146,14 @@ class TfExtrinsics:
         self.unusable: set[str] = set()
 
     @property
+    def used(self) -> dict[str, Pose2 | None]:
+        """Poses of the sensors that were looked up, by frame; None for those that moved on the robot."""
+        return {frame: None if frame in self._moved else pose for frame, pose in self._used.items()}
+
+    @property
     def fixed(self) -> dict[str, Pose2]:
         """Poses of the sensors that were looked up and did not move on the robot, by frame."""
-        return {frame: pose for frame, pose in self._used.items() if frame not in self._moved}
+        return {frame: pose for frame, pose in self.used.items() if pose is not None}
 
     @property
     def known(self) -> dict[str, Pose2]:

@@ -45,7 +45,7 @@ class KeptJournal:
         parameters = Parameters.from_flat(values)
         self.node = Node(parameters)
         self.associator = PoseAssociator(lambda base, frame, stamp: SONAR, parameters)
-        self.mounts: dict[str, Pose2] = {}
+        self.mounts: dict[str, Pose2 | None] = {}
         self.keeper = JournalKeeper(self.node, str(folder), self.associator, lambda: self.mounts)  # type: ignore[arg-type]
         self.keeper.open()
 
@@ -148,6 +148,20 @@ def test_sensor_that_was_moved_since_earlier_readings_is_named(tmp_path: Path) -
     kept.keeper.take()
     kept.keeper.close()
     assert not any('pose on the robot' in text for text in kept.node.warned), 'a new drive has no earlier readings'
+
+
+def test_sensor_on_a_turret_is_not_said_to_be_moved_after_a_restart(tmp_path: Path) -> None:
+    for first in (0, 10):
+        kept = KeptJournal(tmp_path).start()
+        # at its first readings, it seems to be fixed
+        poses = [Pose2(0.1, 0.0, 0.1 * first), None]
+        for k, pose in enumerate(poses):
+            kept.mounts['turret'] = pose
+            kept.drive(first + k, 1)
+            kept.keeper.take()
+        kept.keeper.close()
+        assert not any('pose on the robot' in text for text in kept.node.warned)
+        assert stored(tmp_path / 'drive_0001.journal')[1].mounts == {}
 
 
 def test_new_journal_has_no_frame(tmp_path: Path) -> None:
