@@ -160,6 +160,12 @@ class TfExtrinsics:
         """The poses in `fixed`, and those given as parameters."""
         return {**self._given, **{frame.lstrip('/'): pose for frame, pose in self.fixed.items()}}
 
+    def forget(self) -> None:
+        """Forget what was looked up, since a new drive begins, for which a wrong transform may have been corrected."""
+        self._used.clear()
+        self._moved.clear()
+        self.unusable.clear()
+
     def __call__(self, base_frame: str, frame: str, stamp: int) -> Pose2 | Later | str | None:
         """Return the pose of a sensor at a stamp, as defined by `ExtrinsicsLookup`."""
         pose = self._look_up(base_frame, frame, stamp)

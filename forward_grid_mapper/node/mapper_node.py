@@ -379,6 +379,7 @@ class MapperNode(ManagedNode):
         # also readings since its last check
         self.journal.take()
         self.associator.clear(self.parameters)
+        self._extrinsics.forget()
         self.intake.forget()
         kept = self.journal.reset()
         # late subscribers must not get maps that were forgotten
