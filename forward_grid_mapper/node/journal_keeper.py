@@ -17,7 +17,7 @@ from ..core.common.words import counted
 from ..core.messages.message_types import Pose2
 from ..core.messages.pose_association import PoseAssociator
 from ..files.journal import Journal
-from ..files.journal_format import MOUNTS, stated
+from ..files.journal_format import stated, with_mounts
 from .diagnostics import status
 
 CHECK_PERIOD = 0.1
@@ -159,8 +159,7 @@ class JournalKeeper:
                 'stay where they were mapped; if it was wrong before, call reset to begin a new drive'
             )
         self._parameters, self._known_mounts = parameters, known
-        poses = {MOUNTS: {frame: list(pose) for frame, pose in known.items()}} if known else {}
-        journal.parameters = stated(parameters) | poses
+        journal.parameters = with_mounts(stated(parameters), known)
 
     def reset(self) -> str:
         """Begin a new drive after readings were forgotten; return the file of the old ones, in words."""
