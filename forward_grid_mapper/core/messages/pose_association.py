@@ -174,7 +174,7 @@ class PoseAssociator(MessageAccount):
     def add_range(self, message: RangeMessage, sent: int = 0) -> None:
         """Take one Range message; `sent` is when it was published, nanoseconds of the system's clock, 0 if unknown."""
         self.received += 1
-        self.limits.add(message)
+        self.limits.add(message, self.parameters.max_range)
         self.missing.add(message)
         measured = measure(message, self.parameters)
         if isinstance(measured, str):
