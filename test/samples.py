@@ -86,10 +86,11 @@ def random_readings(rng: np.random.Generator, grid: Grid, count: int, z_max: flo
 
 
 def associated(
-    extrinsics: Mapping[str, Pose2], odometry: Iterable[OdometryMessage], ranges: Iterable[RangeMessage]
+    extrinsics: Mapping[str, Pose2], odometry: Iterable[OdometryMessage], ranges: Iterable[RangeMessage], **values: Any
 ) -> PoseAssociator:
     """The associator after a recording of these messages, in the order of their stamps."""
-    made = PoseAssociator(lambda base, frame, stamp: extrinsics.get(frame), Parameters(), patient=True)
+    parameters = Parameters.from_flat(values)
+    made = PoseAssociator(lambda base, frame, stamp: extrinsics.get(frame), parameters, patient=True)
     for message in sorted([*odometry, *ranges], key=lambda m: m.stamp):
         if isinstance(message, RangeMessage):
             made.add_range(message)

@@ -28,7 +28,7 @@ from ..core.common.errors import BagError, OutputError
 from ..core.common.readings import Readings
 from .journal_backlog import Backlog, Copied, Everything, Item, StoppedError
 from .journal_database import FULL, DriveFile, DriveWriter, FolderLock, LostFileError, next_file, number_of
-from .journal_format import DRIVE, OWN, Contents, Insert, encoded, path_rows, reading_rows
+from .journal_format import DRIVE, OWN, Contents, Insert, encoded, path_rows, reading_rows, with_mounts
 from .journal_opening import one_line
 from .journal_reader import is_journal, read_earlier
 from .output_folder import expanded, output_errors
@@ -200,7 +200,7 @@ class Journal:
                 self._notice(f'{file}: {text}; the journal continues in {path.name}')
         names = [name for _, earlier in files for name in earlier.sensors.values()]
         # until the node states its own; the file may have none
-        self.parameters, self._stated = dict(contents.parameters), ()
+        self.parameters, self._stated = with_mounts(contents.parameters, contents.mounts), ()
         self._put_rows(self._head(names, (contents.map_frame, contents.base_frame)), 0)
         if contents.unread:
             self._notice(

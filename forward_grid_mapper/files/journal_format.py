@@ -134,6 +134,12 @@ def stated(parameters: Parameters) -> dict[str, Any]:
     return {row.name: values[row.name] for row in TABLE if row.group != 'node' and values[row.name] != row.default}
 
 
+def with_mounts(parameters: Mapping[str, Any], mounts: Mapping[str, Pose2]) -> dict[str, Any]:
+    """Return parameters in the format of a journal, with the poses of sensors on the robot, by frame."""
+    poses = {MOUNTS: {frame: list(pose) for frame, pose in mounts.items()}} if mounts else {}
+    return {**parameters, **poses}
+
+
 @dataclass
 class Contents:
     """Contents of a journal file besides its readings, complete once these were read, and its faults.

@@ -125,8 +125,9 @@ class EmService:
                 spent = time.monotonic() - begin
                 waited = min(outcome.waited, spent)
                 compiled = f'after {waited:.0f} s of compiling kernels, as at the first start'
-                # the log and /diagnostics have named rejected readings before
-                warnings = [*outcome.warnings, *self._associator.rejection_warnings()]
+                # the log and /diagnostics have named faults of messages before
+                of_messages = [*self._associator.message_warnings(), *self._associator.rejection_warnings()]
+                warnings = [*outcome.warnings, *of_messages]
                 result = summary(outcome.maps, spent - waited, bool(warnings))
                 said = [result, compiled if waited >= LONG_WAIT else '']
                 warned = [f'WARNING: {warning}' for warning in warnings]

@@ -146,14 +146,25 @@ class TfExtrinsics:
         self.unusable: set[str] = set()
 
     @property
+    def used(self) -> dict[str, Pose2 | None]:
+        """Poses of the sensors that were looked up, by frame; None for those that moved on the robot."""
+        return {frame: None if frame in self._moved else pose for frame, pose in self._used.items()}
+
+    @property
     def fixed(self) -> dict[str, Pose2]:
         """Poses of the sensors that were looked up and did not move on the robot, by frame."""
-        return {frame: pose for frame, pose in self._used.items() if frame not in self._moved}
+        return {frame: pose for frame, pose in self.used.items() if pose is not None}
 
     @property
     def known(self) -> dict[str, Pose2]:
         """The poses in `fixed`, and those given as parameters."""
         return {**self._given, **{frame.lstrip('/'): pose for frame, pose in self.fixed.items()}}
+
+    def forget(self) -> None:
+        """Forget what was looked up, since a new drive begins, for which a wrong transform may have been corrected."""
+        self._used.clear()
+        self._moved.clear()
+        self.unusable.clear()
 
     def __call__(self, base_frame: str, frame: str, stamp: int) -> Pose2 | Later | str | None:
         """Return the pose of a sensor at a stamp, as defined by `ExtrinsicsLookup`."""

@@ -18,6 +18,7 @@ from ..core.messages.message_types import OdometryMessage, RangeMessage, odometr
 from ..core.messages.pose_association import MOST_WAITING, PoseAssociator
 from ..core.messages.rep117 import corrected
 from ..core.messages.repeated_topics import RepeatedTopics
+from ..core.messages.sensor_records import has_room
 from .clocks import Arrivals, OdometryClock, SensorClocks
 from .draining import Draining
 from .frames import MapFrame
@@ -101,8 +102,9 @@ class Intake:
         self._arrivals, self._odometry_arrivals = Arrivals(), Arrivals()
         # in the order of arrival
         self._pending: deque[_Pending] = deque()
-        self._pending_ranges = self._refused_ranges = self._losses_logged = self.odometry_arrived = 0
-        self._last_refused: RangeMessage | None = None
+        self._pending_ranges = self._losses_logged = self.odometry_arrived = 0
+        # those refused before `begin`, by frame: the last one, and their number
+        self._refused: dict[str, tuple[RangeMessage, int]] = {}
         self._next_warning = 0.0
         self._more = node.create_guard_condition(self.work)
         self._own = own
@@ -169,7 +171,8 @@ class Intake:
     @property
     def received(self) -> int:
         """Number of Range messages received: accepted + waiting + rejected."""
-        return self._associator.received + self._pending_ranges + self._refused_ranges
+        refused = sum(count for _, count in self._refused.values())
+        return self._associator.received + self._pending_ranges + refused
 
     @property
     def waiting(self) -> int:
@@ -285,9 +288,9 @@ class Intake:
     def begin(self) -> None:
         """Give the associator the messages held back, and later ones as they arrive."""
         self._ready = True
-        if self._last_refused is not None:
-            self._associator.reject(self._last_refused, 'too_many_waiting', self._refused_ranges)
-            self._refused_ranges = 0
+        for message, count in self._refused.values():
+            self._associator.reject(message, 'too_many_waiting', count)
+        self._refused.clear()
         self._wake()
 
     def work(self) -> None:
@@ -332,8 +335,9 @@ class Intake:
             self._associator.reject(message, 'too_many_waiting')
         else:
             # another thread uses the associator
-            self._last_refused = message
-            self._refused_ranges += 1
+            frame = message.frame_id if has_room(self._refused, message.frame_id) else ''
+            _, count = self._refused.get(frame, (message, 0))
+            self._refused[frame] = message, count + 1
 
     def _process(self, pending: _Pending) -> None:
         """Give a message to the associator; odometry may first have to wait for the transform to the map frame."""

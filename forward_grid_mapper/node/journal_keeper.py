@@ -17,7 +17,7 @@ from ..core.common.words import counted
 from ..core.messages.message_types import Pose2
 from ..core.messages.pose_association import PoseAssociator
 from ..files.journal import Journal
-from ..files.journal_format import MOUNTS, stated
+from ..files.journal_format import stated, with_mounts
 from .diagnostics import status
 
 CHECK_PERIOD = 0.1
@@ -43,7 +43,7 @@ class JournalKeeper:
         node: Node,
         folder: str,
         associator: PoseAssociator,
-        mounts: Callable[[], Mapping[str, Pose2]] = dict,
+        mounts: Callable[[], Mapping[str, Pose2 | None]] = dict,
     ) -> None:
         """Prepare; call `open` and `restore` before anything else.
 
@@ -54,7 +54,7 @@ class JournalKeeper:
         folder : str
         associator : PoseAssociator
         mounts : callable
-            Returns the poses of the sensors that have readings and are fixed to the robot, by frame.
+            Returns the poses on the robot of the sensors that have readings, by frame; None for those that moved on it.
         """
         self._node, self._mounts = node, mounts
         # of the journal, and of this run
@@ -147,19 +147,19 @@ class JournalKeeper:
 
     def _describe(self, journal: Journal) -> None:
         parameters, mounts = self._node.parameters, self._mounts()
-        known = {**self._known_mounts, **mounts}
+        # a sensor that moves on the robot, as on a turret, has no pose to compare with after a restart
+        known = {frame: pose for frame, pose in {**self._known_mounts, **mounts}.items() if pose is not None}
         if parameters is self._parameters and known == self._known_mounts:
             return
         before = self._known_mounts
-        if moved := sorted(frame for frame in mounts if frame in before and _moved(before[frame], mounts[frame])):
+        if moved := sorted(frame for frame, pose in known.items() if frame in before and _moved(before[frame], pose)):
             self._node.get_logger().warning(
                 f'journal {journal.path}: the pose on the robot of {", ".join(moved[:MOST_NAMED])}'
                 f'{" and others" if len(moved) > MOST_NAMED else ""} is another one than for earlier readings, which '
                 'stay where they were mapped; if it was wrong before, call reset to begin a new drive'
             )
         self._parameters, self._known_mounts = parameters, known
-        poses = {MOUNTS: {frame: list(pose) for frame, pose in known.items()}} if known else {}
-        journal.parameters = stated(parameters) | poses
+        journal.parameters = with_mounts(stated(parameters), known)
 
     def reset(self) -> str:
         """Begin a new drive after readings were forgotten; return the file of the old ones, in words."""

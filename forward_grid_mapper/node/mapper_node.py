@@ -181,7 +181,7 @@ class MapperNode(ManagedNode):
         self._readings_worker = Worker('readings', self.get_logger().error)
         self._ends += [partial(part.close, 0.5) for part in (self.saver, self._readings_worker)]
         extrinsics = self._extrinsics
-        self.journal = JournalKeeper(self, self.parameters.node.journal, self.associator, lambda: extrinsics.fixed)
+        self.journal = JournalKeeper(self, self.parameters.node.journal, self.associator, lambda: extrinsics.used)
         self.workers = [self._readings_worker, self.live.worker, self.maps.worker, self.em.worker.worker]
         self.workers += [part.worker for part in (self.saver, self.online, following, self.kernels) if part]
         health = Health()
@@ -379,6 +379,7 @@ class MapperNode(ManagedNode):
         # also readings since its last check
         self.journal.take()
         self.associator.clear(self.parameters)
+        self._extrinsics.forget()
         self.intake.forget()
         kept = self.journal.reset()
         # late subscribers must not get maps that were forgotten

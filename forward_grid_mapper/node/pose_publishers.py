@@ -134,7 +134,7 @@ class PosePublishers:
         return stamp == self._latest or stamp in self._stamps
 
     def forget(self) -> None:
-        """Send the next transform with any stamp, since the clock jumped or a new drive begins."""
+        """Send the next transform with any stamp, since the clock jumped."""
         self._sent = (-1, ())
 
     def publish_path(self, frame: str, trajectory: Odometry | None, stamp: Any) -> None:

@@ -159,8 +159,6 @@ class Trajectory:
         self._path_after = -1 if newest is None else newest[0]
         self._jumps_handled, self._jumps_explained = self._associator.time_jumps, 0
         self._use_map_frame(self._parameters.node.refine_poses)
-        if self._publishers is not None:
-            self._publishers.forget()
         self._publish_path()
 
     def mapper(

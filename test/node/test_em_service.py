@@ -17,7 +17,7 @@ from em_robot import BEFORE, GRID, PROGRESS, SO_FAR, EmRobot
 
 from forward_grid_mapper.core.common.errors import InputError
 from forward_grid_mapper.core.common.parameters import Parameters
-from forward_grid_mapper.core.messages.message_types import OdometryMessage, Pose2
+from forward_grid_mapper.core.messages.message_types import OdometryMessage, Pose2, RangeMessage
 from forward_grid_mapper.node import consistency_check, em_service
 
 
@@ -464,6 +464,14 @@ def test_rejected_readings_are_named_in_the_response(robot: EmRobot) -> None:
     assert 'WARNING: 90 of 100 readings were rejected as pose_jump' in answer.sent[0][1]
     # diagnostics have those of the last seconds
     assert not robot.em.wrong_input
+
+
+def test_faults_of_the_messages_are_named_in_the_response(robot: EmRobot) -> None:
+    for k in range(100):
+        robot.associator.add_range(RangeMessage(k + 1, f'sonar_{k % 4}', 10.0 + k, 0.1, 4.0, 0.3))
+    answer = robot.run_em()
+    robot.settle()
+    assert 'WARNING: 100 of 100 examined ranges are larger than max_range (4 m)' in answer.sent[0][1]
 
 
 def test_consistency_is_checked_again_when_the_readings_have_doubled(robot: EmRobot) -> None:

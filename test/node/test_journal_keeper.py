@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import os
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -45,7 +46,7 @@ class KeptJournal:
         parameters = Parameters.from_flat(values)
         self.node = Node(parameters)
         self.associator = PoseAssociator(lambda base, frame, stamp: SONAR, parameters)
-        self.mounts: dict[str, Pose2] = {}
+        self.mounts: dict[str, Pose2 | None] = {}
         self.keeper = JournalKeeper(self.node, str(folder), self.associator, lambda: self.mounts)  # type: ignore[arg-type]
         self.keeper.open()
 
@@ -148,6 +149,35 @@ def test_sensor_that_was_moved_since_earlier_readings_is_named(tmp_path: Path) -
     kept.keeper.take()
     kept.keeper.close()
     assert not any('pose on the robot' in text for text in kept.node.warned), 'a new drive has no earlier readings'
+
+
+def test_sensor_on_a_turret_is_not_said_to_be_moved_after_a_restart(tmp_path: Path) -> None:
+    for first in (0, 10):
+        kept = KeptJournal(tmp_path).start()
+        # at its first readings, it seems to be fixed
+        poses = [Pose2(0.1, 0.0, 0.1 * first), None]
+        for k, pose in enumerate(poses):
+            kept.mounts['turret'] = pose
+            kept.drive(first + k, 1)
+            kept.keeper.take()
+        kept.keeper.close()
+        assert not any('pose on the robot' in text for text in kept.node.warned)
+        assert stored(tmp_path / 'drive_0001.journal')[1].mounts == {}
+
+
+def test_journal_that_continues_a_truncated_one_has_its_poses_of_sensors(tmp_path: Path) -> None:
+    kept = KeptJournal(tmp_path).start()
+    kept.mounts['sonar'] = SONAR
+    for k in range(200):
+        kept.drive(20 * k, 20)
+        kept.keeper.take()
+    kept.keeper.close()
+    os.truncate(tmp_path / 'drive_0001.journal', (tmp_path / 'drive_0001.journal').stat().st_size // 2)
+    kept = KeptJournal(tmp_path).start()
+    kept.settle()
+    kept.keeper.close()
+    found, contents = stored(tmp_path / 'drive_0002.journal')
+    assert len(found) > 100 and contents.earlier is None and contents.mounts == {'sonar': SONAR}
 
 
 def test_new_journal_has_no_frame(tmp_path: Path) -> None:

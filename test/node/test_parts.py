@@ -559,6 +559,7 @@ def test_reset_empties_the_published_maps_before_work_on_new_ones_begins() -> No
         parameters=None,
         journal=journal,
         associator=associator,
+        _extrinsics=noting('poses forget'),
         intake=noting('intake forget'),
         trajectory=noting('trajectory begin'),
         maps=noting('maps clear'),
@@ -570,5 +571,5 @@ def test_reset_empties_the_published_maps_before_work_on_new_ones_begins() -> No
     MapperNode.reset(node, reply)
     assert answers == [(True, '7 readings and all maps were deleted; they are kept')]
     assert done[:2] == ['journal take', 'readings clear']
-    assert set(done[2:4]) == {'intake forget', 'trajectory begin'}
-    assert done[4] == 'maps clear' and set(done[5:]) == {'em reset', 'feed reset'}
+    assert set(done[2:5]) == {'poses forget', 'intake forget', 'trajectory begin'}
+    assert done[5] == 'maps clear' and set(done[6:]) == {'em reset', 'feed reset'}

@@ -163,6 +163,24 @@ def test_transform_is_repeated_without_new_odometry(
     assert seconds_of(sent[-1]) == pytest.approx(100.3) and len(sent) == 5
 
 
+def test_transform_after_a_reset_is_later_than_all_before(
+    inside: Callable[..., Inside], quick: Any, tf2_ros: type[Broadcaster], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """TF ignores stamps that it has, and would keep the correction of the drive before."""
+    monkeypatch.setattr(pose_publishers, 'REPEAT', 0.0)
+    robot = inside(refine_poses=True).start()
+    robot.drive(0, 200)
+    assert robot.call(robot.node.em.run_em)[0]
+    robot.until(lambda: numbers(tf2_ros.sent[-1]) != (0.0, 0.0, 0.0))
+    for _ in range(3):
+        robot.node.trajectory._tick()
+    before = len(tf2_ros.sent)
+    assert robot.call(robot.node.reset)[0]
+    robot.node.trajectory._tick()
+    stamps = [transform.header.stamp.sec * NANOSECONDS + transform.header.stamp.nanosec for transform in tf2_ros.sent]
+    assert numbers(tf2_ros.sent[-1]) == (0.0, 0.0, 0.0) and min(stamps[before:]) > max(stamps[:before])
+
+
 def test_other_publisher_of_the_transform_is_a_fault(
     inside: Callable[..., Inside], tf2_ros: type[Broadcaster], monkeypatch: pytest.MonkeyPatch
 ) -> None:

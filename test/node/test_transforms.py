@@ -236,6 +236,20 @@ def test_readings_of_inclined_and_steep_sensors(inside: Callable[..., Inside]) -
     assert readings['frames without a pose'] == ''
 
 
+def test_sensor_whose_transform_was_corrected_is_fixed_after_a_reset(inside: Callable[..., Inside]) -> None:
+    robot = begun(inside)
+    buffer: Any = robot.node._extrinsics._transforms._buffer
+    for k, x in enumerate((1.0, 0.1)):
+        pose = Transform()
+        pose.translation.x = x
+        buffer.set_transform_static(pose, '')
+        from_tower(robot, 3 * k, 3)
+    assert robot.node._account().source['extrinsics'] == {}, 'it may be on a joint'
+    assert robot.call(robot.node.reset)[0]
+    from_tower(robot, 6, 3)
+    assert robot.node._account().source['extrinsics'] == {'tower': (0.1, 0.0, 0.0)}
+
+
 class Log:
     """A logger that keeps its lines."""
 

@@ -102,7 +102,7 @@ class BatchAssociator(PoseAssociator):
         ranges, odometry = batch
         newest = self._history.newest
         self._take_odometry(odometry)
-        self.limits.add_all(ranges)
+        self.limits.add_all(ranges, self.parameters.max_range)
         self.missing.add_all(ranges)
         measured = measure_all(ranges, self.parameters)
         frames = list(ranges.frames)

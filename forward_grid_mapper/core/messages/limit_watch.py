@@ -99,14 +99,24 @@ class LimitWatch:
         """Remove all samples."""
         self._of.clear()
 
-    def add(self, message: RangeMessage) -> None:
-        """Take a message."""
-        if samples := record_of(self._of, message.frame_id, _Samples):
-            samples.add(message.range, message.min_range, message.max_range)
+    def add(self, message: RangeMessage, given: float = 0.0) -> None:
+        """Take a message; `given` is the parameter `max_range`, 0 if it is not set.
 
-    def add_all(self, messages: Ranges) -> None:
+        That of the message is wrong then if no sonar measures so far, or if it is smaller. A larger one may be right:
+        the user may want to map only what is near.
+        """
+        if samples := record_of(self._of, message.frame_id, _Samples):
+            limit = message.max_range
+            if given:
+                limit = max(limit, given) if limit < LONGEST_RANGE else given
+            samples.add(message.range, message.min_range, limit)
+
+    def add_all(self, messages: Ranges, given: float = 0.0) -> None:
         """Apply `add` to many messages."""
-        values = np.stack([messages.range, messages.min_range, messages.max_range], axis=1)
+        limits = messages.max_range
+        if given:
+            limits = np.where(limits < LONGEST_RANGE, np.maximum(limits, given), given)
+        values = np.stack([messages.range, messages.min_range, limits], axis=1)
         for frame, part in messages.of_each():
             if samples := record_of(self._of, frame, _Samples):
                 samples.add_all(values[part])

@@ -174,7 +174,7 @@ class PoseAssociator(MessageAccount):
     def add_range(self, message: RangeMessage, sent: int = 0) -> None:
         """Take one Range message; `sent` is when it was published, nanoseconds of the system's clock, 0 if unknown."""
         self.received += 1
-        self.limits.add(message)
+        self.limits.add(message, self.parameters.max_range)
         self.missing.add(message)
         measured = measure(message, self.parameters)
         if isinstance(measured, str):
@@ -190,7 +190,7 @@ class PoseAssociator(MessageAccount):
         self._settle()
 
     def clear(self, parameters: Parameters | None = None) -> None:
-        """Remove readings, counts and path; odometry is kept, so that the next reading gets a pose.
+        """Remove readings, counts and path; the last second of odometry is kept, so that the next reading gets a pose.
 
         `parameters` are those of the new maps.
         """
@@ -198,6 +198,9 @@ class PoseAssociator(MessageAccount):
         if self._other_frame:
             self.map_frame = self.base_frame = ''
             self._history.clear()
+        elif self._history.newest is not None:
+            # the clock may begin anew, and the next reading may have a stamp of the drive that is forgotten
+            self._history.forget_before(self._history.newest - JUMP)
         self.record.begin_anew()
         self.buffer.clear()
         self.limits.clear()
@@ -302,7 +305,8 @@ class PoseAssociator(MessageAccount):
         self._settle_up_to(self._history.newest)
         self.time_jumps += 1
         # as after a reset between two drives: the poses that are forgotten are those of the drive before
-        self.jumps_before_begin += self.odometry_received == 1 and not len(self.buffer)
+        first = self.odometry_received - self.odometry_rejected.total() == 1
+        self.jumps_before_begin += first and not len(self.buffer)
         for frame_id, count in Counter(
             m.frame_id for m in (*self._without_pose, *(measured for measured, _, _ in self._without_extrinsics))
         ).items():

@@ -133,6 +133,11 @@ class PoseHistory:
         if old > FEWEST and old >= len(stamps) // 2:
             del stamps[: old - 1], self._poses[: old - 1]
 
+    def forget_before(self, stamp: int) -> None:
+        """Remove poses before a stamp, except the last two; the record keeps them."""
+        count = min(bisect_left(self._stamps, stamp), max(len(self._stamps) - 2, 0))
+        del self._stamps[:count], self._poses[:count]
+
     def at(self, stamp: int, max_gap: float) -> Pose2 | str:
         """Return the pose at a stamp, or the reason why there is none (`rep117.REASONS`).
 

@@ -103,7 +103,11 @@ REASONS_OUTSIDE_MESSAGE = {
 """Reasons that are not in the message itself; a running node reports them elsewhere."""
 
 
-CHOSEN_BY_USER = {'over_range', 'paused'}
+PAUSED = 'paused'
+"""The reason for readings that came while the user had paused mapping: they say nothing about sensors."""
+
+
+CHOSEN_BY_USER = {'over_range'}
 """Reasons that the user chose, which are no fault of a sensor: there may be no object in its direction."""
 
 
@@ -195,11 +199,15 @@ def _offset(parameters: AssociationParameters) -> int:
 def rejection_warnings(
     rejected: Mapping[str, int], received: int, what: str = 'readings', known: Container[str] = ()
 ) -> list[str]:
-    """Return a warning for each reason, other than known ones, for which many of the readings were rejected."""
+    """Return a warning for each reason, other than known ones, for which many of the readings were rejected.
+
+    Those that came during a pause do not count.
+    """
+    judged = received - rejected.get(PAUSED, 0)
     return [
-        f'{count} of {received} {what} were rejected as {reason}: {REASONS[reason]}'
+        f'{count} of {judged} {what} were rejected as {reason}: {REASONS[reason]}'
         for reason, count in rejected.items()
-        if count > MANY_REJECTED * received and reason not in known
+        if count > MANY_REJECTED * judged and reason not in known and reason != PAUSED
     ]
 
 
@@ -210,7 +218,7 @@ def sensor_rejections(
 
     There is one as well if those without an echo are rejected, of all sensors: the map lacks their free space. There is
     none for reasons that the user chose, for those that are frequent among all readings (`rejection_warnings`), and if
-    no sensor works.
+    no sensor works. Readings that came during a pause do not count.
 
     Parameters
     ----------
@@ -219,6 +227,7 @@ def sensor_rejections(
     accepted : mapping of str to (int, int)
         From `ReadingBuffer.counts`.
     """
+    by_frame = {frame: judged for frame, counts in by_frame.items() if (judged := _without_paused(counts))}
     rejected: Counter[str] = sum(map(Counter, by_frame.values()), Counter())
     many = MANY_REJECTED * (rejected.total() + sum(count for count, _ in accepted.values()))
     lost: dict[str, list[str]] = {}
@@ -235,6 +244,10 @@ def sensor_rejections(
         f'were rejected as {reason}: {_BROKEN if reason in NO_ECHO_REASONS else REASONS[reason]}'
         for reason, frames in lost.items()
     ] + _instead_of_no_echo(by_frame, accepted, rejected, {*lost, *(each for each in NO_ECHO_REASONS if each in known)})
+
+
+def _without_paused(counts: Mapping[str, int]) -> dict[str, int]:
+    return {reason: count for reason, count in counts.items() if reason != PAUSED}
 
 
 def _instead_of_no_echo(

@@ -266,6 +266,20 @@ def test_wrong_input_gives_one_warning_with_the_cause(name: str) -> None:
     assert len(warnings) == 1, f'one cause, one warning: {warnings}'
 
 
+@pytest.mark.parametrize(('limit', 'given', 'warned'), [(500.0, 5.0, 1), (0.5, 5.0, 1), (5.0, 1.5, 0)])
+def test_max_range_as_a_parameter_replaces_wrong_limits(limit: float, given: float, warned: int) -> None:
+    """The warning asks for it; and a smaller one than that of the messages, to map only what is near, is no fault."""
+    wrong = drive().with_ranges(lambda m: m._replace(max_range=limit))
+    assert len(associated(*wrong).message_warnings()) == warned
+    assert associated(*wrong, max_range=given).message_warnings() == []
+
+
+def test_ranges_are_compared_with_max_range_as_a_parameter() -> None:
+    centimetres = drive().with_ranges(lambda m: m._replace(range=100 * m.range, max_range=500.0))
+    (warning,) = associated(*centimetres, max_range=5.0).message_warnings()
+    assert 'are the ranges in centimetres and the limits in metres' in warning
+
+
 def test_limits_in_the_wrong_order_are_no_question_of_units() -> None:
     """The readings are rejected as bad_limits, which is said elsewhere."""
     swapped = drive().with_ranges(lambda m: m._replace(min_range=m.max_range, max_range=m.min_range))

@@ -215,17 +215,19 @@ def test_measurements_of_a_batch_equal_single_ones(seed: int, angle: float, limi
             )
 
 
+@pytest.mark.parametrize('max_range', [0.0, 0.6])
 @pytest.mark.parametrize('sizes', [[10, 5000, 1, 1, 1023, 7000], [1024, 1024, 1, 9000], [20000]])
-def test_limits_of_a_batch_are_checked_as_for_single_messages(sizes: list[int]) -> None:
+def test_limits_of_a_batch_are_checked_as_for_single_messages(sizes: list[int], max_range: float) -> None:
     one, many = LimitWatch(), LimitWatch()
     rng, names = random.Random(3), ['left', 'right', 'rare']
     for size in sizes:
         messages = [
-            RangeMessage(0, rng.choice(names), rng.random(), rng.random(), rng.random(), 0.3) for _ in range(size)
+            RangeMessage(0, rng.choice(names), rng.random(), rng.random(), rng.choice((1.0, 200.0)) * rng.random(), 0.3)
+            for _ in range(size)
         ]
         for message in messages:
-            one.add(message)
-        many.add_all(batch_of(list(enumerate(messages))).ranges)
+            one.add(message, max_range)
+        many.add_all(batch_of(list(enumerate(messages))).ranges, max_range)
     assert one._of.keys() == many._of.keys() == set(names)
     for name in names:
         first, second = one._of[name], many._of[name]

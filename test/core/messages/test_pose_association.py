@@ -600,6 +600,28 @@ def test_stamp_zero_is_rejected_with_its_own_reason() -> None:
     assert len(p.buffer) == 1
 
 
+def test_drive_after_a_reset_begins_with_odometry_that_is_accepted() -> None:
+    """Drivers may send a message without an orientation first."""
+    p = associator()
+    p.add_odometry(odometry(10.0))
+    p.clear()
+    p.add_odometry(odometry(1.0)._replace(pose=None))
+    p.add_odometry(odometry(1.1))
+    assert (p.odometry_rejected, p.time_jumps, p.jumps_before_begin) == ({'bad_pose': 1}, 1, 1)
+
+
+def test_reading_after_a_reset_has_no_pose_of_the_drive_before() -> None:
+    """The clock of a simulation begins anew, and a reading comes before odometry."""
+    p = associator()
+    for tenth in range(100):
+        p.add_odometry(odometry(0.1 * tenth, 0.05 * tenth))
+    p.clear()
+    p.add_range(sonar(5.0))
+    for tenth in range(100):
+        p.add_odometry(odometry(0.1 * tenth, 50.0 + 0.05 * tenth))
+    assert (len(p.buffer), p.rejected, p.jumps_before_begin) == (0, {'before_odometry': 1}, 1)
+
+
 @pytest.mark.parametrize('reset', [False, True])
 def test_reading_from_the_future_does_not_delay_others(reset: bool) -> None:
     clock = Clock()

@@ -28,6 +28,15 @@ def history(*poses: tuple[float, Pose2]) -> PoseHistory:
     return made
 
 
+def test_last_two_poses_are_not_forgotten() -> None:
+    made = history(*((float(second), Pose2(second, 0, 0)) for second in range(5)))
+    made.forget_before(2 * SECOND)
+    assert (len(made), made.at(SECOND, 1.0), made.at(2 * SECOND, 1.0)) == (3, 'before_odometry', Pose2(2, 0, 0))
+    made.forget_before(9 * SECOND)
+    assert (made.before, made.newest, len(made.record)) == (3 * SECOND, 4 * SECOND, 5)
+    PoseHistory().forget_before(SECOND)
+
+
 def test_yaw_is_interpolated_the_shorter_way() -> None:
     pose = interpolate(Pose2(0.0, 2.0, 3.1), Pose2(1.0, 4.0, -3.1), 0.25)
     assert pose == pytest.approx((0.25, 2.5, 3.1 + 0.25 * (2 * math.pi - 6.2)))

@@ -52,13 +52,25 @@ def test_warning_names_a_sensor_with_nearly_all_readings_rejected() -> None:
     assert sensor_rejections({'': {'empty_frame_id': 50}}, fine) == []
     assert sensor_rejections({'left': {'too_near': 600}}, fine) == []
     # no warning for a sensor without echoes, if these are discarded on purpose
-    assert sensor_rejections({'left': {'over_range': 95}, 'right': {'paused': 50}}, fine) == []
+    assert sensor_rejections({'left': {'over_range': 95}}, fine) == []
     # a fault of all sensors has other warnings
     assert sensor_rejections({'left': {'too_near': 95}}, {'left': (2, 0)}) == []
     assert sensor_rejections({'left': {'too_near': 95}}, {}) == []
     without_stamps = {'zero_stamp': 900}
     assert sensor_rejections({'left': {'too_near': 95}, 'right': without_stamps}, {'left': (2, 0)}) == []
     assert len(sensor_rejections({'left': {'too_near': 95}, 'right': without_stamps}, {'rear': (2, 0)})) == 1
+
+
+def test_a_pause_is_no_fault_and_hides_none() -> None:
+    assert rejection_warnings({'paused': 900}, 1000) == []
+    (warning,) = rejection_warnings({'paused': 900, 'nan_range': 30}, 1000)
+    assert warning.startswith('30 of 100 readings were rejected as nan_range')
+    fine = {f'sonar_{k}': (100, 20) for k in range(20)}
+    pause = {frame: {'paused': 300} for frame in (*fine, 'unused')}
+    assert sensor_rejections(pause, fine) == []
+    (warning,) = sensor_rejections({**pause, 'left': {'paused': 300, 'too_near': 95}}, {**fine, 'left': (2, 0)})
+    assert warning.startswith('nearly all readings of left were rejected as too_near')
+    assert sensor_rejections({'paused before it was repaired': {'paused': 50}}, {}) == []
 
 
 def test_warning_of_no_echo_that_is_rejected() -> None:
