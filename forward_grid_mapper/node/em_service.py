@@ -75,6 +75,8 @@ class EmService:
         Returns the poses of the sensors that are fixed to the robot, by frame.
     mounts : callable
         The same, including sensors that have not sent yet.
+    restored_mounts : callable
+        Returns the poses with which the readings of a journal were placed, as far as they are known.
     """
 
     def __init__(
@@ -101,6 +103,7 @@ class EmService:
         self.no_map_frame: Callable[[], str] = str
         self.extrinsics: Callable[[], Mapping[str, Pose2]] = dict
         self.mounts: Callable[[], Mapping[str, Pose2]] = dict
+        self.restored_mounts: Callable[[], Mapping[str, Pose2]] = dict
         self._parameters, self._associator, self._publishers = parameters, associator, publishers
         self._trajectory = trajectory
         self._inbox, self._kernels, self._logger = inbox, kernels, logger
@@ -232,7 +235,8 @@ class EmService:
         """Begin a run, and have callers called with its outcome."""
         generation, parameters = self._publishers.generation, self._parameters()
         compiled = all(map(self._kernels.has, self._kernel_steps()))
-        data = RunInput(self._associator, self._inbox, self.mounts(), compiled, lambda: run.cancelled)
+        mounts, restored = self.mounts(), self.restored_mounts()
+        data = RunInput(self._associator, self._inbox, mounts, compiled, lambda: run.cancelled, restored)
 
         def on_maps(maps: MapSet) -> None:
             if isinstance(mapper, RefiningMapper) or in_map_frame:

@@ -36,7 +36,13 @@ FULL = (errno.ENOSPC, errno.EDQUOT)
 
 
 class JournalKeeper:
-    """Keeps a node's journal; does nothing if the folder is ''."""
+    """Keeps a node's journal; does nothing if the folder is ''.
+
+    Attributes
+    ----------
+    restored_mounts : mapping of str to Pose2
+        The poses on the robot of the sensors that have readings of an earlier run, by frame.
+    """
 
     def __init__(
         self,
@@ -57,6 +63,7 @@ class JournalKeeper:
             Returns the poses on the robot of the sensors that have readings, by frame; None for those that moved on it.
         """
         self._node, self._mounts = node, mounts
+        self.restored_mounts: Mapping[str, Pose2] = {}
         # of the journal, and of this run
         self._known_mounts: dict[str, Pose2] = {}
         self._associator = associator
@@ -112,6 +119,7 @@ class JournalKeeper:
         for readings in journal.restore():
             refused += associator.restore(readings)
         associator.map_frame, associator.base_frame = journal.contents.map_frame, journal.contents.base_frame
+        self.restored_mounts = {frame.lstrip('/'): pose for frame, pose in journal.contents.mounts.items()}
         self._known_mounts = dict(journal.contents.mounts)
         for point in journal.contents.path:
             associator.extend_path(point)
@@ -165,7 +173,7 @@ class JournalKeeper:
         """Begin a new drive after readings were forgotten; return the file of the old ones, in words."""
         self._restored = self._taken = 0
         self._last_point = None
-        self._known_mounts, self._parameters = {}, None
+        self._known_mounts, self._parameters, self.restored_mounts = {}, None, {}
         if self._journal is None:
             return ''
         old = self._journal.path

@@ -182,6 +182,7 @@ class MapperNode(ManagedNode):
         self._ends += [partial(part.close, 0.5) for part in (self.saver, self._readings_worker)]
         extrinsics = self._extrinsics
         self.journal = JournalKeeper(self, self.parameters.node.journal, self.associator, lambda: extrinsics.used)
+        self.em.restored_mounts = lambda: self.journal.restored_mounts
         self.workers = [self._readings_worker, self.live.worker, self.maps.worker, self.em.worker.worker]
         self.workers += [part.worker for part in (self.saver, self.online, following, self.kernels) if part]
         health = Health()

@@ -39,6 +39,7 @@ class RunInput:
         mounts: Mapping[str, Pose2],
         compiled: bool,
         cancelled: Callable[[], bool],
+        restored_mounts: Mapping[str, Pose2],
     ) -> None:
         """Take what the node holds now.
 
@@ -52,9 +53,12 @@ class RunInput:
             Whether the run can begin at once.
         cancelled : callable
             Returns whether the run is cancelled, so that it waits no longer for the executor.
+        restored_mounts : mapping
+            The poses on the robot with which readings of an earlier run were placed, by frame, as far as it is known.
         """
         self._associator, self._inbox, self._cancelled = associator, inbox, cancelled
         self._mounts, self._bound = dict(mounts), associator.buffer.bound
+        self._earlier_mounts = {**mounts, **restored_mounts}
         self._clock_jumped, self._waits_for_kernels, self._begun = associator.time_jumps > 0, not compiled, False
         self._taken = self._take()
 
@@ -102,7 +106,7 @@ class RunInput:
         held, known = self._taken.readings, Odometry.of(*self._taken.odometry)
         if self._clock_jumped:
             return RefinementInput(that_placed(held, known, self._mounts), held)
-        return RefinementInput(recovered(known, held, self._mounts), held)
+        return RefinementInput(recovered(known, held, self._earlier_mounts), held)
 
     def drive_so_far(self) -> RefinementInput:
         """Return the drive up to now.

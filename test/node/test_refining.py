@@ -416,6 +416,25 @@ def test_odometry_is_recovered_from_the_journal_after_a_restart(
     assert_live(robot, seen[-1])
 
 
+@pytest.mark.parametrize('moved', [True, False])
+def test_odometry_is_recovered_with_the_poses_of_sensors_in_the_journal(
+    inside: Callable[..., Inside], quick: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, moved: bool
+) -> None:
+    """After the restart the sensor is elsewhere on the robot, or has sent nothing yet, so that TF was not asked."""
+    options = {'refine_poses': True, 'journal': str(tmp_path / 'journal')}
+    robot = inside(**options).start()
+    robot.drive(0, 150)
+    before = odometry_of(robot)
+    robot.close()
+    seen = odometry_of_runs(quick, monkeypatch)
+    robot = inside(**options, **{'sensors.sonar.pose': [0.5, 0.2, 0.4]}).start()
+    if not moved:
+        robot.node._extrinsics._given.clear()
+    assert robot.call(robot.node.em.run_em)[0]
+    assert np.array_equal(seen[0].stamp, before.stamp)
+    assert seen[0].pose == pytest.approx(before.pose, abs=1e-9)
+
+
 @pytest.mark.parametrize(
     ('back', 'looped', 'kept'), [(4.0, False, 0), (10.0, False, 0), (20.0, False, 250), (7.45, True, 250)]
 )
