@@ -387,7 +387,7 @@ def test_robot_that_was_carried_away_gives_a_warning(exact: Recording, bent: tup
     there = replace(there, x=sensors[:, 0].copy(), y=sensors[:, 1].copy(), yaw=sensors[:, 2].copy())
     columns = {
         name: np.concatenate([getattr(readings, name), getattr(there, name)])
-        for name in ('x', 'y', 'yaw', 'z', 'z_max', 'half_angle', 'sigma', 'stamp', 'sensor')
+        for name in ('x', 'y', 'yaw', 'z', 'z_max', 'half_angle', 'sigma', 'stamp', 'sensor', 'drive')
     }
     both = replace(readings, **columns)
     whole = Odometry.of(stamp, np.concatenate([odometry.pose, compose(away, elsewhere.pose)]))

@@ -190,6 +190,7 @@ def test_trajectory_that_mainly_turns_odometry_is_judged_by_readings(bent, monke
 
     monkeypatch.setattr(refinement, 'match_drive', turned)
     monkeypatch.setattr(refinement, 'gain_at_revisits', lambda *rest: Gain(0.1, 0.01))
+    monkeypatch.setattr(refinement, 'confirmed_by_places', lambda *rest: True)
     taken = Refiner(Parameters()).run(recording.readings, odometry)
     assert taken.accepted and taken.moved < 0.15
     assert taken.turned == pytest.approx(angle / 2, rel=0.1)
