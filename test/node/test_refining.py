@@ -394,14 +394,20 @@ def odometry_of_runs(quick: Any, monkeypatch: pytest.MonkeyPatch) -> list[Odomet
     return seen
 
 
-def test_odometry_is_recovered_from_the_journal_after_a_restart(
-    inside: Callable[..., Inside], quick: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    options = {'refine_poses': True, 'journal': str(tmp_path / 'journal')}
+def driven_before(inside: Callable[..., Inside], journal: Path) -> tuple[dict[str, Any], Odometry]:
+    """Drive a node with a journal, and close it; return its options and its odometry."""
+    options = {'refine_poses': True, 'journal': str(journal)}
     robot = inside(**options).start()
     robot.drive(0, 150)
     before = odometry_of(robot)
     robot.close()
+    return options, before
+
+
+def test_odometry_is_recovered_from_the_journal_after_a_restart(
+    inside: Callable[..., Inside], quick: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    options, before = driven_before(inside, tmp_path / 'journal')
     seen = odometry_of_runs(quick, monkeypatch)
     robot = inside(**options).start()
     assert len(robot.node.associator.buffer) == 150
@@ -421,11 +427,7 @@ def test_odometry_is_recovered_with_the_poses_of_sensors_in_the_journal(
     inside: Callable[..., Inside], quick: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, moved: bool
 ) -> None:
     """After the restart the sensor is elsewhere on the robot, or has sent nothing yet, so that TF was not asked."""
-    options = {'refine_poses': True, 'journal': str(tmp_path / 'journal')}
-    robot = inside(**options).start()
-    robot.drive(0, 150)
-    before = odometry_of(robot)
-    robot.close()
+    options, before = driven_before(inside, tmp_path / 'journal')
     seen = odometry_of_runs(quick, monkeypatch)
     robot = inside(**options, **{'sensors.sonar.pose': [0.5, 0.2, 0.4]}).start()
     if not moved:
