@@ -238,11 +238,9 @@ def near_words(moved: float) -> str:
 
 def unconfirmed_words(part: float) -> str:
     """Return why matching alone is not used if this part of the blocks on its earlier visits is recognised."""
-    recognised = (
-        f'only {part:.0%} of the path through places seen before is'
-        if part < LEAST_RECOGNISED
-        else ('hardly any of the places to which the robot came back by odometry are')
-    )
+    recognised = 'hardly any of the places to which the robot came back by odometry are'
+    if part < LEAST_RECOGNISED:
+        recognised = f'only {part:.0%} of the path through places seen before is'
     return (
         f'; with scan matching alone, {recognised} recognised, and within a few metres it does not predict readings '
         'clearly better than odometry'

@@ -99,8 +99,8 @@ def recognised_part(scans: Scans, nodes: Floats, loops: Sequence[Loop]) -> float
 def confirmed_by_places(scans: Scans, nodes: Floats, loops: Sequence[Loop]) -> bool:
     """Return whether places seen before confirm a trajectory: nearly all blocks on an earlier visit are recognised.
 
-    These are half as many as by odometry, or more: a trajectory that comes back to no place has none to be recognised.
-    True if neither comes back to a place.
+    There must be at least half as many of them as blocks that lie on an earlier visit by odometry: a trajectory that
+    comes back to no place has none to be recognised. True if neither comes back to a place.
     """
     if 2 * len(recognised(loops)) < len(revisits(scans, scans.windows.node)):
         return False

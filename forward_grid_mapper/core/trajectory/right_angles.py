@@ -227,8 +227,8 @@ def _at_revisits(drive: Drive, walls: _AlongWalls, nodes: Floats, watch: Progres
     """Judge refined nodes where the robot came back, or by votes of walls if it did not.
 
     Revisits show drift over the whole drive, and walls that are not parallel. Whether the robot came back is decided
-    along the refined nodes, since by odometry it may be wrong. But votes do not suffice for walls along which it comes
-    back nowhere if it does by odometry: a corridor around a hall is not straight because its walls can be taken for
+    along the refined nodes, since by odometry it may be wrong. But votes do not suffice if the robot comes back to
+    places by odometry and to none along the refined nodes: the walls of a corridor around a hall can be taken for
     straight ones.
     """
     revisited = has_revisits(drive.scans, nodes)
