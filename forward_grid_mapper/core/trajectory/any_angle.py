@@ -73,6 +73,7 @@ def match_drive(
     start_stage: Callable[[str], Progress],
     noise: float = 0.0,
     known: Floats | None = None,
+    start: Floats | None = None,
 ) -> MatchedDrive | None:
     """Return the trajectory of a drive from matching alone; None if its J is not larger than that of odometry.
 
@@ -89,21 +90,29 @@ def match_drive(
         σ of the yaw error of odometry, radians a √metre; 0 if it is not known.
     known : float64, shape (K, 3), optional
         Nodes of the trajectory from walls.
+    start : float64, shape (K, 3), optional
+        Nodes from which matching starts, before scan matching is tried.
     """
     best, value = None, scans.objective(scans.windows.node)
     if known is not None:
         value = max(value, scans.objective(known))
+    remaining = min(REMAINING_YAW_NOISE, noise or REMAINING_YAW_NOISE)
+    if start is not None:
+        best = _match_repeatedly(odometry, scans, start_stage, start, remaining, value)
+        if best is not None:
+            value = best.value
+            # if most places are recognised another trial hardly helps
+            if best.part >= LEAST_RECOGNISED:
+                return best
     for trust in TRUSTS:
-        start = scan_matched(scans, trust._replace(yaw=noise or trust.yaw), start_stage('scan matching'))
-        if known is not None and gain_over_drive(scans, known, start, start_stage('judgement')).sigmas < WORTH_A_TRIAL:
+        nodes = scan_matched(scans, trust._replace(yaw=noise or trust.yaw), start_stage('scan matching'))
+        if known is not None and gain_over_drive(scans, known, nodes, start_stage('judgement')).sigmas < WORTH_A_TRIAL:
             break
-        found = _match_repeatedly(
-            odometry, scans, start_stage, start, min(REMAINING_YAW_NOISE, noise or REMAINING_YAW_NOISE), value
-        )
+        found = _match_repeatedly(odometry, scans, start_stage, nodes, remaining, value)
         if found is not None:
             best, value = found, found.value
-        # if most places are recognised another trial hardly helps, nor if J of the first is no larger
-        if best is None or best.part >= LEAST_RECOGNISED:
+        # nor if J of the first is no larger
+        if found is None or found.part >= LEAST_RECOGNISED:
             break
     return best
 

@@ -6,6 +6,7 @@ import math
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ..common.readings import Floats, Readings
 from .holding_out import Gain
@@ -27,6 +28,10 @@ class Drive(NamedTuple):
     windows: Windows
     scans: Scans
 
+    def with_held_out(self, held_out: NDArray[np.bool_]) -> Drive:
+        """Return the same drive with other windows held out, shape (K,)."""
+        return self._replace(scans=self.scans.with_held_out(held_out))
+
 
 class Attempt(NamedTuple):
     """The result by one method.
@@ -44,6 +49,8 @@ class Attempt(NamedTuple):
         Whether it was refused before anything was matched, because nothing showed that odometry is wrong.
     unproven : Attempt or None
         The trajectory that was refused after matching, because it did not show that odometry is wrong.
+    start : float64, shape (K, 3), or None
+        Nodes of a trajectory that was refused after matching, from which other methods may start.
     """
 
     refinement: Refinement
@@ -52,6 +59,7 @@ class Attempt(NamedTuple):
     by_votes: bool = False
     before_matching: bool = False
     unproven: Attempt | None = None
+    start: Floats | None = None
 
 
 def refined(odometry: Odometry, windows: Windows, nodes: Floats) -> Odometry:

@@ -42,9 +42,9 @@ FEWEST_BLOCKS = 5
 """Fewest blocks that trajectories are compared by."""
 
 
-def held_out(count: int) -> NDArray[np.bool_]:
-    """Return which of `count` windows are held out, shape (count,)."""
-    out: NDArray[np.bool_] = np.arange(count) % EVERY == EVERY // 2
+def held_out(count: int, first: int = EVERY // 2) -> NDArray[np.bool_]:
+    """Return which of `count` windows are held out, shape (count,), beginning with window `first`."""
+    out: NDArray[np.bool_] = np.arange(count) % EVERY == first
     return out
 
 

@@ -36,7 +36,7 @@ from .outcome import Differences, Refinement, differences, joined_parts, replace
 from .passes import BLOCK
 from .refinable import unfit, without_times
 from .relocating import LEAST_RECOGNISED, confirmed_by_places
-from .right_angles import at_right_angles
+from .right_angles import at_right_angles, proven_in_folds
 from .scans import Scans
 from .standing import without_stands
 from .windows import TRAVEL, Odometry, cut
@@ -126,7 +126,7 @@ class Refiner:
             return by_walls.refinement
         found = self._at_any_angle(drive, by_walls, least)
         if found is by_walls.refinement and by_walls.by_votes:
-            return _unless_unsupported(drive, by_walls)
+            return self._unless_unsupported(drive, by_walls, noise)
         return found
 
     def _at_any_angle(self, drive: Drive, by_walls: Attempt, least: Differences) -> Refinement:
@@ -137,7 +137,8 @@ class Refiner:
         if apart > SCAN_MATCHED:
             return _without_better(by_walls.refinement, too_sparse_words(apart))
         try:
-            found = match_drive(odometry, scans, self._start_stage, self._parameters.association.odometry_noise, known)
+            noise = self._parameters.association.odometry_noise
+            found = match_drive(odometry, scans, self._start_stage, noise, known, by_walls.start)
         except InputError:
             # at the cell size of matching, the map of the whole drive may be too large although the final maps are not
             found = None
@@ -205,6 +206,22 @@ class Refiner:
         found = by_walls.refinement
         return replace(found, reason=found.reason + SHOWN_BY_MATCHING)
 
+    def _unless_unsupported(self, drive: Drive, by_walls: Attempt, noise: float) -> Refinement:
+        """Return a trajectory that only doubtful walls support, or odometry if nothing else supports it as well.
+
+        J must do so, or readings of other held-out windows.
+        """
+        try:
+            better = gain_of_objective(drive.scans, drive.windows.node, by_walls.nodes)
+        except InputError:
+            # the map along this trajectory is too large
+            better = Gain(0.0, np.inf)
+        if better.sigmas >= LEAST_SIGMAS:
+            return by_walls.refinement
+        if (proven := proven_in_folds(drive, by_walls, noise, self._start_stage)) is not None:
+            return proven.refinement
+        return _unsupported(drive, by_walls, better)
+
     def _start_stage(self, stage: str) -> Callable[[float], None]:
         def progress(part: float) -> None:
             check(self._stop)
@@ -252,16 +269,8 @@ def _without_better(found: Refinement, why: str = NOR_MATCHES) -> Refinement:
     return found if found.accepted else replace(found, reason=found.reason + why)
 
 
-def _unless_unsupported(drive: Drive, by_walls: Attempt) -> Refinement:
-    """Return a trajectory that only doubtful walls support, or odometry if J does not support it as well."""
-    readings, odometry, windows, scans = drive
-    try:
-        better = gain_of_objective(scans, windows.node, by_walls.nodes)
-    except InputError:
-        # the map along this trajectory is too large
-        better = Gain(0.0, np.inf)
-    if better.sigmas >= LEAST_SIGMAS:
-        return by_walls.refinement
+def _unsupported(drive: Drive, by_walls: Attempt, better: Gain) -> Refinement:
+    """Return odometry, since the gain in J does not support a trajectory from walls."""
     by = (
         f' ({better.mean:.1f} ± {better.error:.1f} nats for each {BLOCK * TRAVEL:g} m)' if better.error < np.inf else ''
     )
@@ -270,7 +279,7 @@ def _unless_unsupported(drive: Drive, by_walls: Attempt) -> Refinement:
         f'than with odometry{by}'
     )
     found = by_walls.refinement
-    return Refinement(False, reason + NOR_MATCHES, readings, odometry, found.calibration, gain=found.gain)
+    return Refinement(False, reason + NOR_MATCHES, drive.readings, drive.odometry, found.calibration, gain=found.gain)
 
 
 def _recognition_words(part: float) -> str:

@@ -10,9 +10,10 @@ from typing import NamedTuple
 import numpy as np
 
 from ..common.readings import Floats
-from .attempt import ACCURACY, Attempt, Drive, gain_words, refined
+from .attempt import ACCURACY, EXACT, Attempt, Drive, gain_words, refined
+from .folds import accepted_in_folds
 from .heading import NOISES, Heading, heading
-from .holding_out import LEAST_SIGMAS, Gain, has_revisits
+from .holding_out import FEWEST_BLOCKS, LEAST_SIGMAS, Gain, has_revisits
 from .hypotheses import Solved, solve_hypotheses
 from .judging import gain_at_revisits, gain_over_drive, last_not_worse, turns_supported
 from .loops import Loop
@@ -20,9 +21,10 @@ from .odometry_model import CALIBRATION
 from .outcome import Differences, Refinement, differences, replaced
 from .passes import Progress
 from .pose_graph import Solution
-from .relocating import LEAST_RECOGNISED, recognised_part
+from .poses import rms_after_alignment
+from .relocating import LEAST_RECOGNISED, confirmed_by_places, recognised, recognised_part
 from .scans import Scans
-from .solving import Solver
+from .solving import SETTLED, Solver
 from .walls import wall_votes
 from .windows import Windows
 
@@ -30,6 +32,9 @@ LEAST_VOTE_GAIN, LEAST_SIGMAS_WITH_WALLS = 10.0, -1.0
 """If votes of walls are likelier by this many nats than with the yaw of odometry, beyond what random ranges give, and
 the robot came back to no place, the gain in predicting readings need only be this many standard errors: readings must
 not be predicted worse. Small drift hardly shows within a few metres."""
+
+ROUNDS = 3
+"""Most times that the drive is matched again if readings do not show that odometry is wrong."""
 
 LEAST_CERTAINTY = 0.9
 """Least probability that no right angle of the heading was lost."""
@@ -142,15 +147,33 @@ def at_right_angles(
             return _unproven(drive, walls, walls.verdict)._replace(before_matching=True)
     found = solve_hypotheses(drive.scans, walls.heading, walls.solver, walls.along, solver_of)
     if found.certainty < LEAST_CERTAINTY:
-        return _heading_lost(drive, found.certainty)
+        return _heading_lost(drive, found.certainty)._replace(start=found.solution.nodes)
     watch = start_stage('judgement')
-    best = _best_of(drive, walls, found)
-    verdict = walls.verdict if walls.proven else _at_revisits(drive, walls, best.nodes, watch)
+    best, verdict = _judged(drive, walls, found, watch)
+    if not verdict.accepted and (further := _matched_further(drive.scans, found)) is not found:
+        best, verdict = _judged(drive, walls, further, watch)
     attempt = _accepted(drive, best, verdict, walls.heading.drifts.noise, least)
     if verdict.accepted or odometry_is_wrong:
         return attempt
-    unproven = attempt if attempt.refinement.accepted else None
-    return _unproven(drive, walls, verdict)._replace(unproven=unproven)
+    if not attempt.refinement.accepted:
+        return _unproven(drive, walls, verdict)
+    if (proven := proven_in_folds(drive, attempt, odometry_noise, start_stage)) is not None:
+        return proven
+    return _unproven(drive, walls, verdict)._replace(unproven=attempt, start=attempt.nodes)
+
+
+def proven_in_folds(
+    drive: Drive, attempt: Attempt, odometry_noise: float, start_stage: Callable[[str], Progress]
+) -> Attempt | None:
+    """Return the trajectory with walls if other held-out windows show that odometry is wrong; otherwise None.
+
+    `attempt` is the one that does not show it; the other parameters are those of `at_right_angles`.
+    """
+
+    def solve(other: Drive) -> Attempt:
+        return at_right_angles(other, odometry_noise, EXACT, start_stage, odometry_is_wrong=True)
+
+    return accepted_in_folds(drive, attempt, solve)
 
 
 def heading_of_walls(
@@ -189,6 +212,27 @@ def _along_walls(
     return _AlongWalls(heading, vote_gain, solver, along, _by_name(calibration), simple, better)
 
 
+def _matched_further(scans: Scans, found: Solved) -> Solved:
+    """Return the drive matched again from its solution, as long as J grows and nodes move."""
+    value = scans.objective(found.solution.nodes)
+    for _ in range(ROUNDS):
+        solution, loops = found.solver.with_matches(found.solution)
+        now = scans.objective(solution.nodes)
+        if now <= value:
+            return found
+        moved = rms_after_alignment(found.solution.nodes, solution.nodes)
+        found, value = replace(found, solution=solution, loops=loops), now
+        if moved < SETTLED:
+            return found
+    return found
+
+
+def _judged(drive: Drive, walls: _AlongWalls, found: Solved, watch: Progress) -> tuple[_Candidate, _Verdict]:
+    """Return the best nodes of a solved drive, and the judgement."""
+    best = _best_of(drive, walls, found)
+    return best, walls.verdict if walls.proven else _at_revisits(drive, walls, best, watch)
+
+
 def _best_of(drive: Drive, walls: _AlongWalls, found: Solved) -> _Candidate:
     """Return the solution with matches, or the one before it that predicts held-out readings better."""
     solver, simple = found.solver, walls.simple
@@ -223,25 +267,32 @@ def _unproven(drive: Drive, walls: _AlongWalls, verdict: _Verdict) -> Attempt:
     return _kept(drive, verdict.words + NOT_ENOUGH, walls.calibration, verdict.gain.mean, agrees)
 
 
-def _at_revisits(drive: Drive, walls: _AlongWalls, nodes: Floats, watch: Progress) -> _Verdict:
-    """Judge refined nodes where the robot came back, or by votes of walls if it did not.
+def _at_revisits(drive: Drive, walls: _AlongWalls, best: _Candidate, watch: Progress) -> _Verdict:
+    """Judge refined nodes where the robot came back, or by votes of walls.
 
     Revisits show drift over the whole drive, and walls that are not parallel. Whether the robot came back is decided
     along the refined nodes, since by odometry it may be wrong. But votes do not suffice if the robot comes back to
     places by odometry and to none along the refined nodes: the walls of a corridor around a hall can be taken for
-    straight ones.
+    straight ones. If it comes back along the refined nodes, votes suffice if the places are recognised.
     """
-    revisited = has_revisits(drive.scans, nodes)
-    if not revisited and (not walls.votes_suffice or has_revisits(drive.scans, drive.windows.node)):
+    revisited, by_odometry = (has_revisits(drive.scans, nodes) for nodes in (best.nodes, drive.windows.node))
+    if not revisited and (not walls.votes_suffice or by_odometry):
         return walls.verdict
-    better = gain_at_revisits(drive.scans, drive.windows.node, nodes, watch)
+    better = gain_at_revisits(drive.scans, drive.windows.node, best.nodes, watch)
     words = gain_words(better)
     if revisited:
-        return _Verdict(better.sigmas >= LEAST_SIGMAS, better, f'where the robot came back, {words}')
+        words = f'where the robot came back, {words}'
+        if better.sigmas >= LEAST_SIGMAS or not (walls.votes_suffice and _is_recognised(drive.scans, best)):
+            return _Verdict(better.sigmas >= LEAST_SIGMAS, better, words)
     if better.sigmas < LEAST_SIGMAS_WITH_WALLS:
         return _Verdict(False, better, words)
     likelier = f'the readings are more likely by {walls.vote_gain:.0f} nats than with odometry'
     return _Verdict(True, better, f'with walls at right angles, {likelier}; {words}', by_votes=True)
+
+
+def _is_recognised(scans: Scans, best: _Candidate) -> bool:
+    """Return whether enough places are recognised along nodes to confirm them."""
+    return len(recognised(best.loops)) >= FEWEST_BLOCKS and confirmed_by_places(scans, best.nodes, best.loops)
 
 
 def _accepted(drive: Drive, best: _Candidate, verdict: _Verdict, noise: float, least: Differences) -> Attempt:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import itertools
+from copy import copy
 
 import numpy as np
 from numpy.typing import NDArray
@@ -60,6 +61,13 @@ class Scans:
         mixed = whole.readings[np.lexsort((np.random.default_rng(0).random(len(window)), window))]
         self.count = np.where(held_out, 0, np.diff(first))
         self.scan = [Scan(mixed[begin:end], whole.weight) for begin, end in itertools.pairwise(first.tolist())]
+
+    def with_held_out(self, held_out: NDArray[np.bool_]) -> Scans:
+        """Return the same scans with other windows held out."""
+        out = copy(self)
+        out.held_out, out.count = held_out, np.where(held_out, 0, np.diff(self.windows.first))
+        out.predictions, out._explained = {}, {}
+        return out
 
     def joint(self, members: NDArray[np.int64], poses: Floats) -> Scan:
         """Return the readings of several windows as one scan; `poses` of their nodes have the shape (members, 3)."""

@@ -122,6 +122,33 @@ def test_rounds_end_early_below_the_j_of_a_known_trajectory(bent, scans, monkeyp
         assert len(trials.calls) == rounds
 
 
+@pytest.mark.parametrize(
+    ('values', 'begins', 'value'),
+    [
+        # scan matching is not tried if most places are recognised from the start
+        ([(0.9, 1.0)], [1.0], 1.0),
+        ([(0.5, 1.0), (0.5, 0.5), (0.9, 3.0)], [1.0, 2.0, 0.0], 3.0),
+        ([(0.5, 2.0), (0.5, 0.5), (0.9, 1.0)], [1.0, 2.0, 0.0], 2.0),
+        ([(0.9, -1.0), (0.9, 1.0)], [1.0, 0.0], 1.0),
+    ],
+)
+def test_matching_begins_with_the_given_nodes(
+    bent, scans, monkeypatch, values: list[tuple[float, float]], begins: list[float], value: float
+) -> None:
+    trials, first = Trials(monkeypatch, values), scans.windows.node[0, 0]
+    start, solve, seen = scans.windows.node + np.array([1.0, 0.0, 0.0]), Trials.with_matches, list[float]()
+
+    def with_matches(trial: Trials, solution: Solution) -> tuple[Solution, list]:
+        seen.append(solution.nodes[-1, 0] - scans.windows.node[-1, 0])
+        return solve(trial, solution)
+
+    monkeypatch.setattr(Trials, 'with_matches', with_matches)
+    found = any_angle.match_drive(bent[1], scans, lambda stage: quietly, start=start)
+    assert found is not None and found.value == value
+    assert seen == pytest.approx(begins)
+    assert len(trials.calls) == len(values) and start[0, 0] == first + 1.0
+
+
 @pytest.mark.parametrize('factor', [0.9, 1.1])
 def test_wrong_scale_of_a_drive_is_found_by_its_objective(exact, scans, factor: float) -> None:
     true = odometry_of(exact).at(scans.windows.node_stamp)
