@@ -211,6 +211,17 @@ def rejection_warnings(
     ]
 
 
+def odometry_rejections(
+    rejected: Mapping[str, int], received: int, least: float = 0.0, what: str = 'odometry messages'
+) -> list[str]:
+    """Return a warning for each reason for which more than a fraction `least` of odometry was rejected."""
+    return [
+        f'{count} of {received} {what} were rejected: {ODOMETRY_REASONS[reason]}'
+        for reason, count in rejected.items()
+        if count > least * received
+    ]
+
+
 def sensor_rejections(
     by_frame: Mapping[str, Mapping[str, int]], accepted: Mapping[str, tuple[int, int]], known: Container[str] = ()
 ) -> list[str]:
