@@ -474,6 +474,16 @@ def test_faults_of_the_messages_are_named_in_the_response(robot: EmRobot) -> Non
     assert 'WARNING: 100 of 100 examined ranges are larger than max_range (4 m)' in answer.sent[0][1]
 
 
+def test_two_sources_of_odometry_are_named_in_the_response(robot: EmRobot) -> None:
+    for k in range(40):
+        robot.associator.add_odometry(
+            OdometryMessage(k * 50_000_000, 'odom', 'base', Pose2(0.05 * k, 50.0 * (k % 2), 0.0))
+        )
+    answer = robot.run_em()
+    robot.settle()
+    assert 'WARNING: poses jump back and forth, by 50.00 m in 39 of 39 steps; do two nodes' in answer.sent[0][1]
+
+
 def test_answer_names_odometry_that_was_rejected(robot: EmRobot) -> None:
     robot.associator.odometry_received = 100
     robot.associator.odometry_rejected.update(other_frame=50, bad_pose=1)
