@@ -34,6 +34,7 @@ from .rep117 import (
     odometry_rejections,
     rejection_warnings,
     sensor_rejections,
+    swapped_frames,
 )
 from .robot_path import RobotPath
 from .stamp_order import JUMP, JUMPED_BACK, WAS_AHEAD, order_of
@@ -169,8 +170,8 @@ class PoseAssociator(MessageAccount):
         return self.record.snapshot(int(stamps.min()) if len(stamps) else None)
 
     def message_warnings(self) -> list[str]:
-        """Return warnings about the Range messages so far; empty if there is no suspicion."""
-        return [*self.limits.warnings(), *self.missing.warnings()]
+        """Return warnings about the messages so far; empty if there is no suspicion."""
+        return [*swapped_frames(self.map_frame, self.base_frame), *self.limits.warnings(), *self.missing.warnings()]
 
     def rejection_warnings(self) -> list[str]:
         """Return warnings about the readings and poses that were rejected so far; empty if they are few."""

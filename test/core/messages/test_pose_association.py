@@ -683,6 +683,29 @@ def test_reset_with_another_odometry_frame_starts_again() -> None:
     assert (p.map_frame, len(p.buffer)) == ('odom', 1)
 
 
+@pytest.mark.parametrize(
+    ('frame', 'child', 'wrong'),
+    [
+        ('odom', 'base_link', False),
+        ('map', 'base_footprint', False),
+        ('odom_combined', '', False),
+        ('', '', False),
+        ('base_link', 'odom', True),
+        ('/robot1/base_footprint', 'robot1/odom', True),
+        ('base_link', '', True),
+        ('odom', 'odom', True),
+        ('base_link', 'base_link', True),
+    ],
+)
+def test_swapped_frames_of_odometry_are_named(frame: str, child: str, wrong: bool) -> None:
+    p = associator()
+    p.add_odometry(odometry(1.0)._replace(frame_id=frame, child_frame_id=child))
+    warnings = p.message_warnings()
+    assert len(warnings) == wrong
+    if wrong:
+        assert f'odometry has frame_id {frame} and child_frame_id {child or "(none)"}' in warnings[0]
+
+
 def test_odometry_in_another_frame_may_begin_after_a_reset() -> None:
     p = associator()
     for second in (1.0, 1.5):
