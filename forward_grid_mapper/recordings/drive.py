@@ -152,7 +152,7 @@ class Drive:
         Data for the report.
     live : FullLiveMap
     mounts : mapping of str to Pose2, optional
-        If there is no recorded odometry, the given poses of sensors on the robot, by frame.
+        If there is no recorded odometry, the poses of sensors on the robot, by frame: given ones, or of the journal.
     """
 
     associator: PoseAssociator
