@@ -164,7 +164,7 @@ def _pose_descriptor(name: str) -> ParameterDescriptor:
 
 
 def _deletes(change: RosParameter) -> bool:
-    return change.type_ == RosParameter.Type.NOT_SET
+    return bool(change.type_ == RosParameter.Type.NOT_SET)
 
 
 def _is_pose(name: str) -> bool:
