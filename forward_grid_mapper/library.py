@@ -21,7 +21,7 @@ from .core.messages.extrinsics import Mount
 from .core.messages.message_types import NANOSECONDS, OdometryMessage, Pose2, RangeMessage
 from .core.messages.mounts import FARTHEST_MOUNT, more_than_a_turn
 from .core.messages.pose_association import PoseAssociator
-from .core.messages.rep117 import ODOMETRY_REASONS, REASONS, rejection_warnings, sensor_rejections
+from .core.messages.rep117 import REASONS, odometry_rejections, rejection_warnings, sensor_rejections
 from .files.pose_files import poses_from_csv, poses_from_tum
 from .files.quality_warning import data_warnings
 from .files.results import write_results
@@ -206,9 +206,10 @@ def make_maps(
             RangeMessage(int(stamps[i]), names[i], float(values[i]), s.min_range, s.max_range, s.field_of_view)
         )
     associator.finish()
+    refused = odometry_rejections(associator.odometry_rejected, associator.odometry_received, what='poses')
     if not len(associator.buffer):
         reasons = '; '.join(f'{n} {reason} ({REASONS[reason]})' for reason, n in associator.rejected.most_common())
-        reasons += ''.join(f'; {text}' for text in _pose_warnings(associator))
+        reasons += ''.join(f'; {text}' for text in refused)
         spans = f'poses span {odometry[0].stamp / 1e9:.3f} … {odometry[-1].stamp / 1e9:.3f} s'
         reasons += _unit_of_stamps(odometry, chosen)
         raise InputError(
@@ -220,7 +221,7 @@ def make_maps(
         *_of_the_node(chosen),
         *arrays.ambiguous_stamps(odometry),
         *alternation_note(associator),
-        *_pose_warnings(associator),
+        *refused,
         *associator.message_warnings(),
         *rejection_warnings(associator.rejected, len(values), 'ranges'),
         *sensor_rejections(associator.rejected_by_frame, associator.buffer.counts()),
@@ -252,11 +253,3 @@ def _of_the_node(parameters: Parameters) -> list[str]:
     values = parameters.flat()
     names = [row.name for row in TABLE if row.group == 'node' and values[row.name] != row.default]
     return [f'these parameters are only for the node and are ignored: {", ".join(names)}'] if names else []
-
-
-def _pose_warnings(associator: PoseAssociator) -> list[str]:
-    """Return warnings about poses that were not used."""
-    return [
-        f'{count} of {associator.odometry_received} poses were rejected: {ODOMETRY_REASONS[reason]}'
-        for reason, count in associator.odometry_rejected.items()
-    ]

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..core.common.errors import InputError
+from ..core.common.errors import InputError, ParameterError
 from ..core.common.readings import Readings
 from ..core.common.words import counted
 from ..core.maps.cell_evidence import CellEvidence, cell_evidence
@@ -59,6 +59,8 @@ def parser() -> argparse.ArgumentParser:
 
 def explain(options: argparse.Namespace) -> int:
     """Run the command with its options."""
+    if options.readings is not None and options.readings < 0:
+        raise ParameterError('--readings must be a positive number or 0')
     given = Path(options.maps)
     folder = given.parent if given.name == ARCHIVE and given.is_file() else given
     maps = read_npz(folder / ARCHIVE)
@@ -73,7 +75,7 @@ def explain(options: argparse.Namespace) -> int:
     if options.json:
         print_json(explanation_data(maps, readings, found, options.readings))
     else:
-        shown = MOST_SHOWN if options.readings is None else max(options.readings, 0)
+        shown = MOST_SHOWN if options.readings is None else options.readings
         print('\n'.join(explanation(maps, readings, found, shown)))
     return 0
 
@@ -95,7 +97,7 @@ def explanation_data(
             'stamp': readings.stamp[i],
             'sensor': _name(readings, i),
         }
-        for k, i in enumerate(found.readings[: None if shown is None else max(shown, 0)].tolist())
+        for k, i in enumerate(found.readings[:shown].tolist())
     ]
     return {
         'row': found.row,

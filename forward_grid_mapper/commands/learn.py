@@ -98,6 +98,9 @@ def learn(options: argparse.Namespace) -> int:
             raise OutputError(f'{output.parent} is not a folder; make it first, or choose another with --output')
         if why := unwritable(output.parent):
             raise OutputError(f'{output}: {why}; choose another folder with --output')
+        # permissions do not show every reason, such as a read-only file system
+        write_new_file(output, '')
+        output.unlink()
     part, poses = chosen_part(options), chosen_poses(options)
     with Ticker(options.quiet) as ticker:
         drives = read_drives(

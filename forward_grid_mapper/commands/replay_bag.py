@@ -164,19 +164,17 @@ def _print_warning(text: str) -> None:
 
 
 def _positive(text: str) -> float:
-    value = _number(text)
-    if not value:
-        raise argparse.ArgumentTypeError(f'{text!r} is not above 0')
-    return value
+    return _number(text, above=True)
 
 
-def _number(text: str) -> float:
+def _number(text: str, above: bool = False) -> float:
     try:
         value = float(text)
     except ValueError:
         value = math.nan
-    if not 0 <= value < math.inf:
-        raise argparse.ArgumentTypeError(f'{text!r} is not a number of at least 0 (the bag goes before the options)')
+    if not 0 <= value < math.inf or (above and not value):
+        least = 'above 0' if above else 'of at least 0'
+        raise argparse.ArgumentTypeError(f'{text!r} is not a number {least} (the bag goes before the options)')
     return value
 
 

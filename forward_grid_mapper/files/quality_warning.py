@@ -6,6 +6,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ..core.common.parameters import Parameters
 from ..core.common.readings import Floats, Readings, drives_of
@@ -16,7 +17,8 @@ from ..core.learning.consistency import consistency_warnings
 from ..core.learning.input_warnings import input_warnings
 from ..core.learning.range_warnings import STANDSTILL_STEP
 from ..core.maps.map_set import MapSet
-from ..core.messages.message_types import Pose2
+from ..core.messages.message_types import NANOSECONDS, Pose2
+from ..core.trajectory.jumps import FASTEST
 
 MANY_UNEXPLAINED = 0.5
 """Fraction of unexplained readings above which there is a warning."""
@@ -25,6 +27,15 @@ NOT_CONVERGED = 'the search ended at max_iterations before it converged; raise m
 
 LEAST_READINGS = 20
 """Fewest readings for a judgement."""
+
+MOST_JUMPED = 0.1
+"""Fraction of steps that are jumps, from which the poses have a wrong unit, or are not those of a robot."""
+
+LEAST_JUMP = 0.1
+"""Metres that poses of one source may jump without a motion."""
+
+FEWEST_RETURNS = 4
+"""Fewest steps to another place and back that are not regarded as outliers."""
 
 FEW_RANDOM = 0.05
 """Random part of the echoes up to which the halves of a drive are not compared, which takes a second."""
@@ -153,6 +164,32 @@ def jumps_warning(steps: Floats, jumped: Sequence[int], remedy: str) -> str:
     return (
         f'odometry jumps {often} by {steps[first]:.1f} m after {steps[:first].sum():.0f} m of driving: readings after '
         f'the jump are mapped in a wrong place; {remedy}'
+    )
+
+
+def alternation_warning(stamp: NDArray[np.int64], pose: Floats) -> str:
+    """Return a warning if poses jump to another place and back, as when two sources publish alternately; or ''.
+
+    Parameters
+    ----------
+    stamp : int64, shape (M,)
+        Nanoseconds, increasing.
+    pose : float64, shape (M, 3)
+        x, y and yaw.
+    """
+    if len(stamp) < 3:
+        return ''
+    steps = np.hypot(*np.diff(pose[:, :2], axis=0).T)
+    jumped = steps > LEAST_JUMP + FASTEST * np.diff(stamp) / NANOSECONDS
+    back = np.hypot(*(pose[2:, :2] - pose[:-2, :2]).T)
+    returned = jumped[:-1] & jumped[1:] & (back < np.minimum(steps[:-1], steps[1:]) / 2)
+    both = np.append(returned, False) | np.append(False, returned)
+    count = int(np.count_nonzero(both))
+    if count < max(MOST_JUMPED * len(steps), FEWEST_RETURNS):
+        return ''
+    return (
+        f'poses jump back and forth, by {np.median(steps[both]):.2f} m in {count} of {len(steps)} steps; do two nodes '
+        'publish on this topic? Use the poses of only one of them, otherwise the map shows everything twice'
     )
 
 

@@ -11,7 +11,7 @@ from ..core.messages.message_types import Pose2
 from ..core.messages.odometry_record import OdometryRecord
 from ..core.trajectory.jumps import MOST_JUMPS, jumps, may_jump
 from ..core.trajectory.windows import STILL, Odometry
-from ..files.quality_warning import jumps_warning
+from ..files.quality_warning import alternation_warning, jumps_warning
 
 RECENT = 60_000_000_000
 """Nanoseconds of odometry before the last pose, from which the usual distance between poses follows."""
@@ -32,7 +32,9 @@ class Jump(NamedTuple):
 
 
 def jump_warnings(odometry: Odometry) -> list[str]:
-    """Return a warning if odometry jumps, for maps along it; not if it seems to consist of jumps."""
+    """Return a warning if odometry jumps, for maps along it; if it seems to consist of jumps, only if to and fro."""
+    if alternation := alternation_warning(odometry.stamp, odometry.pose):
+        return [alternation]
     at = jumps(odometry)
     if len(at) > MOST_JUMPS:
         return []

@@ -130,7 +130,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return 1
     finally:
         if node is not None:
-            node.close()
+            node.close('the node is being stopped')
             node.destroy_node()
         if executor is not None:
             # otherwise it finds ROS shut down when it is collected, and prints a traceback

@@ -23,6 +23,10 @@ except ImportError:  # without lifecycle_msgs it is a node like any other, and s
     MANAGED = False
 
 
+CLEANED_UP = 'the node is being cleaned up'
+"""The reason for which calls of services fail that wait at *clean up*."""
+
+
 class ManagedNode(Base):
     """Maps transitions to four methods, and destroys at cleanup what was created since the configuration.
 
@@ -54,8 +58,8 @@ class ManagedNode(Base):
     def deactivate(self) -> None:
         """Unsubscribe."""
 
-    def close(self) -> None:
-        """End the work that `configure` began."""
+    def close(self, why: str = CLEANED_UP) -> None:
+        """End the work that `configure` began; calls that wait are told `why`."""
 
     # starting without a manager
 
@@ -112,7 +116,7 @@ class ManagedNode(Base):
 
     def on_shutdown(self, state: Any) -> Any:
         """End the node's work; its process continues until it is stopped."""
-        return self._transition(self._undo)
+        return self._transition(partial(self._undo, 'the node is being shut down'))
 
     def on_error(self, state: Any) -> Any:
         """Make the node unconfigured after something failed."""
@@ -146,9 +150,9 @@ class ManagedNode(Base):
 
         return answer
 
-    def _undo(self) -> None:
+    def _undo(self, why: str = CLEANED_UP) -> None:
         """End the work, and destroy the entities created for it; what fails is logged, and the rest is done."""
-        self._attempt(self.close)
+        self._attempt(partial(self.close, why))
         while self._created:
             destroy, entity = self._created.pop()
             self._attempt(partial(destroy, entity))

@@ -33,7 +33,7 @@ from .frames import MapFrame, TfExtrinsics, Transforms
 from .intake import AT_ONCE, Intake
 from .journal_keeper import JournalKeeper
 from .kernels import Kernels
-from .managed import ManagedNode
+from .managed import CLEANED_UP, ManagedNode
 from .map_publishers import MapPublishers
 from .reporter import Reporter
 from .saver import Account, Saver
@@ -253,7 +253,7 @@ class MapperNode(ManagedNode):
         self.intake.unsubscribe()
         self.get_logger().info('inactive: nothing is received; maps and services stay')
 
-    def close(self) -> None:
+    def close(self, why: str = CLEANED_UP) -> None:
         """End the work in the background, also of a configuration that failed; failures are logged."""
         self._started = self.mapping = False
         calls, ends = self._calls, self._ends
@@ -264,10 +264,10 @@ class MapperNode(ManagedNode):
             self._attempt(end)
         # calls that wait will get no result
         for service in calls:
-            self._attempt(partial(service.end, 'the node is being cleaned up'))
+            self._attempt(partial(service.end, why))
 
-    def _undo(self) -> None:
-        super()._undo()
+    def _undo(self, why: str = CLEANED_UP) -> None:
+        super()._undo(why)
         for name in vars(self).keys() - self._own - {'_own'}:
             delattr(self, name)
         # `Kernels` froze the existing objects, and the collector ignores frozen ones

@@ -24,6 +24,13 @@ def _why(associator: PoseAssociator, range_topics: Sequence[str], odom_topic: st
     # odometry that waits for TF has not reached the associator
     if no_map_frame and not came and set(rejected) <= {'no_odometry'}:
         return no_map_frame
+    # readings that wait may come to lack odometry
+    reason, count = max(rejected.items(), key=lambda row: row[1], default=('no_odometry', 0))
+    if reason == 'no_odometry' and not came:
+        return f'no Odometry message has been received on {odom_topic} since the start or reset'
+    if reason == 'no_odometry' and came == refused.total():
+        reason = max(refused, key=lambda key: refused[key])
+        return f'all {came} odometry messages were rejected as {reason}: {ODOMETRY_REASONS[reason]}'
     if not rejected:
         has = (
             'reading has been received, and waits for its pose'
@@ -31,10 +38,4 @@ def _why(associator: PoseAssociator, range_topics: Sequence[str], odom_topic: st
             else 'readings have been received, and wait for their poses'
         )
         return f'{received} {has}'
-    reason, count = max(rejected.items(), key=lambda row: row[1])
-    if reason == 'no_odometry' and not came:
-        return f'no Odometry message has been received on {odom_topic} since the start or reset'
-    if reason == 'no_odometry' and came == refused.total():
-        reason = max(refused, key=lambda key: refused[key])
-        return f'all {came} odometry messages were rejected as {reason}: {ODOMETRY_REASONS[reason]}'
     return f'{count} of {received} readings were rejected as {reason}: {REASONS[reason]}'

@@ -78,7 +78,12 @@ def declare(node: Node) -> tuple[Parameters, dict[str, Pose2], list[str]]:
         values[row.name] = value
         stored = list(value) if isinstance(value, tuple) else value
         node.declare_parameter(row.name, stored, descriptor(row), ignore_override=True)
-    return Parameters.from_flat(values), _extrinsics(given), _unknown_names(given)
+    poses = _extrinsics(given)
+    for name in filter(_is_pose, given):
+        # rclpy has declared it with a fixed type, so that it could not be deleted
+        node.undeclare_parameter(name)
+        node.declare_parameter(name, given[name].value, _pose_descriptor(name), ignore_override=True)
+    return Parameters.from_flat(values), poses, _unknown_names(given)
 
 
 def mounts(node: Node) -> dict[str, Pose2]:
@@ -124,7 +129,7 @@ def validator(
                         f'{name} is read-only while the node is configured: restart the node with it, or set it '
                         'between cleanup and configure'
                     )
-            _extrinsics({change.name: change for change in changes})
+            _extrinsics({change.name: change for change in changes if not _deletes(change)})
             known = {change.name: change.value for change in changes if change.name in NAMES}
             accept(Parameters.from_flat(known, base=current()))
         except ParameterError as error:
@@ -146,6 +151,20 @@ def with_points(changes: list[RosParameter]) -> list[RosParameter]:
         else change
         for change in changes
     ]
+
+
+def _pose_descriptor(name: str) -> ParameterDescriptor:
+    """Return the descriptor of the pose of a sensor."""
+    return ParameterDescriptor(
+        name=name,
+        description='Pose of the sensor on the robot: x, y, yaw [m, m, rad]',
+        additional_constraints='read when the node is configured',
+        dynamic_typing=True,
+    )
+
+
+def _deletes(change: RosParameter) -> bool:
+    return bool(change.type_ == RosParameter.Type.NOT_SET)
 
 
 def _is_pose(name: str) -> bool:

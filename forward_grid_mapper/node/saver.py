@@ -149,7 +149,7 @@ class Saver:
             named.close()
             named.enter_context(self._agreeing)
             if self._ended:
-                raise MapperError('the node is being cleaned up')
+                raise MapperError('the maps were not written in time: the node is being cleaned up or stopped')
 
         def write(folder: Path) -> dict[str, Any]:
             return write_results(folder, maps, account.source, path_xy, account.title, agree=agree, **options)

@@ -17,17 +17,8 @@ from ..core.messages.message_batch import MessageBatch
 from ..core.messages.message_types import NANOSECONDS, Pose2
 from ..core.messages.pose_association import PoseAssociator
 from ..core.messages.robot_path import RobotPath
-from ..core.trajectory.jumps import FASTEST, too_far
-from ..files.quality_warning import jumps_warning, thinned
-
-MOST_JUMPED = 0.1
-"""Fraction of steps that are jumps, from which the poses have a wrong unit, or are not those of a robot."""
-
-LEAST_JUMP = 0.1
-"""Metres that poses of one source may jump without a motion."""
-
-FEWEST_RETURNS = 4
-"""Fewest steps to another place and back that are not regarded as outliers."""
+from ..core.trajectory.jumps import too_far
+from ..files.quality_warning import MOST_JUMPED, alternation_warning, jumps_warning, thinned
 
 
 @dataclass(frozen=True)
@@ -161,7 +152,7 @@ class Drive:
         Data for the report.
     live : FullLiveMap
     mounts : mapping of str to Pose2, optional
-        If there is no recorded odometry, the given poses of sensors on the robot, by frame.
+        If there is no recorded odometry, the poses of sensors on the robot, by frame: given ones, or of the journal.
     """
 
     associator: PoseAssociator
@@ -223,21 +214,7 @@ def jumps_note(associator: PoseAssociator) -> list[str]:
 
 def alternation_note(associator: PoseAssociator) -> list[str]:
     """Return a warning if poses jump to another place and back, as when two sources publish alternately."""
-    stamp, pose = associator.record.snapshot()
-    if len(stamp) < 3:
-        return []
-    steps = np.hypot(*np.diff(pose[:, :2], axis=0).T)
-    jumped = steps > LEAST_JUMP + FASTEST * np.diff(stamp) / NANOSECONDS
-    back = np.hypot(*(pose[2:, :2] - pose[:-2, :2]).T)
-    returned = jumped[:-1] & jumped[1:] & (back < np.minimum(steps[:-1], steps[1:]) / 2)
-    both = np.append(returned, False) | np.append(False, returned)
-    count = int(np.count_nonzero(both))
-    if count < max(MOST_JUMPED * len(steps), FEWEST_RETURNS):
-        return []
-    return [
-        f'poses jump back and forth, by {np.median(steps[both]):.2f} m in {count} of {len(steps)} steps; do two nodes '
-        'publish on this topic? Record the poses of only one of them, otherwise the map shows everything twice'
-    ]
+    return list(filter(None, [alternation_warning(*associator.record.snapshot())]))
 
 
 def _steps(associator: PoseAssociator) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:

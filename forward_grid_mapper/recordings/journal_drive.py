@@ -105,7 +105,9 @@ def read_journal(
         },
         'warnings': warnings + thinning_note(associator),
     }
-    return Drive(associator, source, live, {frame.lstrip('/'): pose for frame, pose in extrinsics.items()})
+    # those that are given take precedence, as in the node
+    mounts = {frame.lstrip('/'): pose for poses in (contents.mounts, extrinsics) for frame, pose in poses.items()}
+    return Drive(associator, source, live, mounts)
 
 
 def _cut(held: Sequence[Readings], path: Path, part: Part) -> list[Readings]:

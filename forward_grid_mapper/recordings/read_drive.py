@@ -22,7 +22,7 @@ from ..core.messages.message_batch import batch_of
 from ..core.messages.message_types import NANOSECONDS, Pose2
 from ..core.messages.mounts import far_mounts
 from ..core.messages.pose_association import PoseAssociator
-from ..core.messages.rep117 import ODOMETRY_REASONS, REASONS, rejection_warnings, sensor_rejections
+from ..core.messages.rep117 import ODOMETRY_REASONS, REASONS, odometry_rejections, rejection_warnings, sensor_rejections
 from ..files.journal import drive_file
 from ..files.output_folder import readable
 from .bag_extrinsics import BagExtrinsics
@@ -200,10 +200,7 @@ def _warnings(bag: Bag, associator: PoseAssociator, lookup: BagExtrinsics) -> li
         )
     warnings += alternation_note(associator)
     warnings += associator.message_warnings()
-    for reason, count in associator.odometry_rejected.items():
-        warnings.append(
-            f'{count} of {associator.odometry_received} odometry messages were rejected: {ODOMETRY_REASONS[reason]}'
-        )
+    warnings += odometry_rejections(associator.odometry_rejected, associator.odometry_received)
     known = {'unknown_extrinsics', STEEP} if lookup.steep else {'unknown_extrinsics'}
     warnings += rejection_warnings(associator.rejected, associator.received, known=known)
     return warnings + sensor_rejections(associator.rejected_by_frame, associator.buffer.counts(), known)

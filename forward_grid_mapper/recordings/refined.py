@@ -33,8 +33,9 @@ Watch = Callable[[str, float], None]
 """Receives the current stage, and its progress from 0 to 1."""
 
 NO_MOUNTS = (
-    'a journal contains no odometry. It can be computed from the readings of sensors that are fixed to the robot: '
-    'give their poses with --sensor, or the parameter file of the node with --params'
+    'a journal contains no odometry. It can be computed from the readings of sensors that are fixed to the robot, '
+    'but this journal has no poses of them: give their poses with --sensor, or the parameter file of the node with '
+    '--params'
 )
 
 NO_TIMES = (
@@ -226,7 +227,7 @@ def _fitted(outcomes: list[Refinement], parameters: Parameters) -> tuple[list[Re
 
 
 def odometry_of(drive: Drive) -> Odometry:
-    """Return the odometry of a drive: as recorded, or from the poses of its readings if sensor poses were given."""
+    """Return the odometry of a drive: as recorded, or from the poses of its readings in a journal."""
     odometry = Odometry.of(*drive.associator.odometry)
     return odometry if drive.mounts is None else recovered(odometry, drive.associator.readings, drive.mounts)
 

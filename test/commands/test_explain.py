@@ -113,6 +113,14 @@ def test_bad_position_is_rejected_with_reason(
     assert message in capsys.readouterr().err
 
 
+@pytest.mark.parametrize('output', [(), ('--json',)])
+def test_negative_number_of_readings_is_refused(
+    maps: Path, output: tuple[str, ...], capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert code_of(explain.main, maps, 0.0, 0.0, '-n', -1, *output) == 1
+    assert '--readings must be a positive number or 0' in capsys.readouterr().err
+
+
 @pytest.mark.parametrize('place', [('-0.4', '-0.2'), ('-4e-1', '-2E-1'), ('-.4', '-.2'), ('-inf', '-1e+2')])
 def test_negative_position_is_not_parsed_as_an_option(
     maps: Path, place: tuple[str, str], capsys: pytest.CaptureFixture[str]

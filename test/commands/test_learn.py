@@ -169,6 +169,15 @@ def test_output_without_permission_is_reported_before_the_work(
     assert message.endswith(f'{tmp_path} is not writable; choose another folder with --output\n')
 
 
+def test_output_that_the_file_system_refuses_is_reported_before_the_work(
+    tmp_path: Path, bag: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(learn, 'read_drives', lambda *arguments: pytest.fail('it began to work'))
+    # the folder can be written, but has no file of this name, like a folder of /proc
+    assert 'cannot be written' in output_of(capsys, bag, '-o', tmp_path / ('x' * 300), code=1)
+    assert not everything_in(tmp_path)
+
+
 def test_bad_arguments_are_rejected(bag: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert '--rounds' in output_of(capsys, bag, '--rounds', 0, code=1)
     assert 'p_hit' in output_of(capsys, bag, '--set', 'p_hit=2', code=1)

@@ -281,6 +281,21 @@ def test_too_many_readings_or_cells_are_left_out(tmp_path: Path, monkeypatch: py
     assert not (tmp_path / 'maps' / 'report.html').exists()
 
 
+def test_headers_of_the_sensors_do_not_touch(tmp_path: Path) -> None:
+    # as narrow as beside long verdicts
+    script = """
+        $('sensor_table').style.width = 'min-content';
+        const ends = [...document.querySelectorAll('#sensor_table th')].map(head => {
+            const range = document.createRange();
+            range.selectNodeContents(head);
+            return range.getBoundingClientRect();
+        });
+        return ends.slice(1).map((head, k) => head.left - ends[k].right);
+    """
+    gaps = found_in(written(tmp_path, made_maps(readings=10)), tmp_path, script)
+    assert len(gaps) == 4 and min(gaps) >= 6, gaps
+
+
 @pytest.mark.parametrize('readings', [0, 10])
 def test_page_with_few_readings_opens(tmp_path: Path, readings: int) -> None:
     page = written(tmp_path, made_maps(readings=readings))

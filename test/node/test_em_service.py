@@ -474,6 +474,27 @@ def test_faults_of_the_messages_are_named_in_the_response(robot: EmRobot) -> Non
     assert 'WARNING: 100 of 100 examined ranges are larger than max_range (4 m)' in answer.sent[0][1]
 
 
+def test_two_sources_of_odometry_are_named_in_the_response(robot: EmRobot) -> None:
+    for k in range(40):
+        robot.associator.add_odometry(
+            OdometryMessage(k * 50_000_000, 'odom', 'base', Pose2(0.05 * k, 50.0 * (k % 2), 0.0))
+        )
+    answer = robot.run_em()
+    robot.settle()
+    assert 'WARNING: poses jump back and forth, by 50.00 m in 39 of 39 steps; do two nodes' in answer.sent[0][1]
+
+
+def test_answer_names_odometry_that_was_rejected(robot: EmRobot) -> None:
+    robot.associator.odometry_received = 100
+    robot.associator.odometry_rejected.update(other_frame=50, bad_pose=1)
+    answer = robot.run_em()
+    robot.settle()
+    message = answer.sent[0][1]
+    assert 'WARNING: 50 of 100 odometry messages were rejected: the frame_id or child_frame_id is not' in message
+    # a few of a long drive are no fault of the map
+    assert 'quaternion' not in message
+
+
 def test_consistency_is_checked_again_when_the_readings_have_doubled(robot: EmRobot) -> None:
     robot.contradictions = ['stamps are late']
 
@@ -521,7 +542,7 @@ def test_run_without_readings_fails_with_reason(
     robot = make(count=0)
     robot.em.range_topics = ['/sonar', '/left']
     robot.error = InputError('there is no reading to map')
-    robot.associator.received = received
+    robot.associator.received, robot.associator.odometry_received = received, 5
     robot.associator.rejected.update(rejected)
     answer = robot.run_em()
     robot.settle()
@@ -529,17 +550,24 @@ def test_run_without_readings_fails_with_reason(
     assert not success and message.startswith('there is nothing to map: ') and expected in message
 
 
-def test_run_without_odometry_fails_with_that_reason(make: Callable[..., EmRobot]) -> None:
+@pytest.mark.parametrize('waiting', [False, True])
+def test_run_without_odometry_fails_with_that_reason(make: Callable[..., EmRobot], waiting: bool) -> None:
     for came, refused, expected in (
         (0, {}, 'no Odometry message has been received on /wheels since the start or reset'),
         (8, {'long_frame_id': 3, 'bad_pose': 5}, 'all 8 odometry messages were rejected as bad_pose: the pose is not'),
-        (9, {'bad_pose': 5}, '6 of 9 readings were rejected as no_odometry: odometry, or its transform'),
+        (
+            9,
+            {'bad_pose': 5},
+            '9 readings have been received, and wait'
+            if waiting
+            else '6 of 9 readings were rejected as no_odometry: odometry, or its transform',
+        ),
     ):
         robot = make(count=0)
         robot.em.odom_topic = '/wheels'
         robot.error = InputError('there is no reading to map')
         robot.associator.received, robot.associator.odometry_received = 9, came
-        robot.associator.rejected.update(no_odometry=6)
+        robot.associator.rejected.update({} if waiting else {'no_odometry': 6})
         robot.associator.odometry_rejected.update(refused)
         answer = robot.run_em()
         robot.settle()

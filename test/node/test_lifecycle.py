@@ -317,7 +317,7 @@ def test_simulated_time_set_at_run_time_stays_after_a_clean_up(
 
 
 def test_read_only_parameters_can_be_set_between_cleanup_and_configure(inside: Callable[..., Inside]) -> None:
-    robot = inside()
+    robot = inside(**{'sensors.removed.pose': [0.9, 0.0, 0.0]})
     node = robot.node
     node.start()
     changes = {
@@ -338,17 +338,33 @@ def test_read_only_parameters_can_be_set_between_cleanup_and_configure(inside: C
     assert not node.has_parameter('sensors.third.pose')
     (result,) = node.set_parameters([Parameter('p_hitt', value=0.5)])
     assert not result.successful and 'did you mean p_hit?' in result.reason
+    # one given at the start, and one set later
+    for name in ('sensors.removed.pose', 'sensors.fourth.pose'):
+        (result,) = node.set_parameters([Parameter(name, value=[0.5, 0.0, 0.0])])
+        assert result.successful
+        (result,) = node.set_parameters([Parameter(name)])
+        assert result.successful and not node.has_parameter(name)
     assert node.trigger_configure() == node.trigger_activate() == TransitionCallbackReturn.SUCCESS
     assert sorted(topic for topic in node.intake.subscriptions if topic != '/odom') == ['/left', '/right']
     robot.until(lambda: node.mapping)
     robot.odometry(100.0)
     robot.range(100.0)
     robot.range(100.0, frame='further')
+    robot.range(100.0, frame='removed')
     assert node.associator.readings.x == pytest.approx([0.5, 0.7])
     assert node.live.grid.resolution == 0.2
 
 
-def test_clean_up_responds_to_waiting_calls(inside: Callable[..., Inside], peer: Callable[[Inside], Any]) -> None:
+@pytest.mark.parametrize(
+    ('end', 'why'),
+    [
+        ('trigger_cleanup', 'the node is being cleaned up'),
+        ('trigger_shutdown', 'the node is being shut down'),
+    ],
+)
+def test_end_of_a_configuration_responds_to_waiting_calls(
+    inside: Callable[..., Inside], peer: Callable[[Inside], Any], end: str, why: str
+) -> None:
     robot = inside().start()
     node = robot.node
 
@@ -364,10 +380,10 @@ def test_clean_up_responds_to_waiting_calls(inside: Callable[..., Inside], peer:
         robot.until(client.service_is_ready, 20.0)
         calls.append(client.call_async(Trigger.Request()))
     robot.until(lambda: node.em.current and len(node.em.current.callers) == 2, 20.0)
-    assert node.trigger_deactivate() == node.trigger_cleanup() == TransitionCallbackReturn.SUCCESS
+    assert node.trigger_deactivate() == getattr(node, end)() == TransitionCallbackReturn.SUCCESS
     robot.until(lambda: all(call.done() for call in calls), 20.0)
     for call in calls:
-        assert (call.result().success, call.result().message) == (False, 'the node is being cleaned up')
+        assert (call.result().success, call.result().message) == (False, why)
 
 
 def test_failed_activation_leaves_no_double_subscriptions(

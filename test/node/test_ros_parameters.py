@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import array
 import math
+import re
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -116,12 +117,17 @@ def test_sensor_poses_are_read(value: Any) -> None:
 
 @pytest.mark.parametrize(
     'value',
-    ['abc', [1.0, 2.0], [1.0, 2.0, 3.0, 4.0], [1.0, 2.0, math.nan], [1.0, math.inf, 0.0], ['a', 'b', 'c'], 3, []],
+    [
+        *('abc', [1.0, 2.0], [1.0, 2.0, 3.0, 4.0], [1.0, 2.0, math.nan], [1.0, math.inf, 0.0], ['a', 'b', 'c'], 3, []),
+        array.array('d', [1.0, 2.0]),
+    ],
 )
 def test_bad_sensor_pose_is_rejected(value: Any) -> None:
+    # rclpy has arrays
+    shown = repr(value.tolist() if isinstance(value, array.array) else value)
     node = Declaring()
     node.given = {'sensors.front.pose': SimpleNamespace(value=value)}
-    with pytest.raises(ParameterError, match=r'sensors\.front\.pose: .* is not \[x, y, yaw\]'):
+    with pytest.raises(ParameterError, match=rf'sensors\.front\.pose: {re.escape(shown)} is not \[x, y, yaw\]'):
         declare(node)
 
 

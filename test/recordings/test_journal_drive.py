@@ -18,10 +18,14 @@ from journal_samples import FRAMES, Previous
 
 from forward_grid_mapper.commands.learn import main as learn
 from forward_grid_mapper.commands.process_bag import main as process_bag
+from forward_grid_mapper.core.common.parameters import Parameters
 from forward_grid_mapper.core.common.readings import Readings
+from forward_grid_mapper.core.messages.message_types import Pose2
 from forward_grid_mapper.files.journal import Journal
-from forward_grid_mapper.files.journal_format import ROW
+from forward_grid_mapper.files.journal_format import ROW, with_mounts
 from forward_grid_mapper.files.map_archive import read_npz
+from forward_grid_mapper.recordings.journal_drive import read_journal
+from forward_grid_mapper.recordings.refined import odometry_of
 
 
 def journal(
@@ -97,6 +101,17 @@ def test_file_that_the_newest_one_continues_is_read_as_well(
         assert f'{expected} received, {expected} accepted' in (output / 'report.txt').read_text()
         warnings = capsys.readouterr().err
         assert said in warnings and ('continues' in warnings) == bool(said)
+
+
+def test_odometry_of_a_journal_is_computed_with_the_poses_of_sensors_in_it(tmp_path: Path) -> None:
+    mounts = {'/sonar': Pose2(0.2, 0.0, 0.0), 'left': Pose2(0.0, 0.1, 1.5)}
+    (path,) = journal(tmp_path / 'j', 20, with_mounts({}, mounts), yaw=0.0).glob('drive_*.journal')
+    drive = read_journal(path, Parameters(), {})
+    assert drive.mounts == {'sonar': Pose2(0.2, 0.0, 0.0), 'left': Pose2(0.0, 0.1, 1.5)}
+    assert odometry_of(drive).pose[0] == pytest.approx([-0.2, 0.0, 0.0])
+    # poses that are given take precedence
+    drive = read_journal(path, Parameters(), {'sonar': Pose2(0.3, 0.0, 0.0)})
+    assert odometry_of(drive).pose[0] == pytest.approx([-0.3, 0.0, 0.0])
 
 
 def test_options_without_effect_on_a_journal_are_reported(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

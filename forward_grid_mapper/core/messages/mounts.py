@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import math
+from array import array
 from collections.abc import Iterable, Mapping
 from numbers import Real
+
+import numpy as np
 
 from ..common.errors import ParameterError
 from .message_types import Pose2
@@ -39,7 +42,8 @@ def mount_from(name: str, values: object) -> Pose2:
     numbers = list(values) if isinstance(values, Iterable) and not isinstance(values, str) else []
     good = [float(v) for v in numbers if isinstance(v, Real) and not isinstance(v, bool) and math.isfinite(v)]
     if len(good) != 3 or len(numbers) != 3:
-        raise ParameterError(f'{name}: {values!r} is not [x, y, yaw], three finite numbers (metres, radians)')
+        shown = values.tolist() if isinstance(values, (array, np.ndarray)) else values
+        raise ParameterError(f'{name}: {shown!r} is not [x, y, yaw], three finite numbers (metres, radians)')
     pose = Pose2(*good)
     if more_than_a_turn(pose.yaw):
         raise ParameterError(

@@ -26,7 +26,16 @@ from .message_types import NANOSECONDS, OdometryMessage, Pose2, RangeMessage
 from .missing_readings import MissingReadings
 from .pose_history import PoseHistory
 from .reading_buffer import ReadingBuffer
-from .rep117 import LONGEST_NAME, Measurement, measure, rejection_warnings, sensor_rejections
+from .rep117 import (
+    LONGEST_NAME,
+    MANY_REJECTED,
+    Measurement,
+    measure,
+    odometry_rejections,
+    rejection_warnings,
+    sensor_rejections,
+    swapped_frames,
+)
 from .robot_path import RobotPath
 from .stamp_order import JUMP, JUMPED_BACK, WAS_AHEAD, order_of
 
@@ -121,7 +130,7 @@ class PoseAssociator(MessageAccount):
         self._next_lookup = self._next_future_check = 0
         self._at_once = at_once or sys.maxsize
         self._odometry_arrival = self._odometry_sent = self._next_lookup_by_clock = 0.0
-        self.behind = self._other_frame = False
+        self.behind = self._other_frame = self._frames_forgettable = False
         self.settled = 0
 
     @property
@@ -161,12 +170,13 @@ class PoseAssociator(MessageAccount):
         return self.record.snapshot(int(stamps.min()) if len(stamps) else None)
 
     def message_warnings(self) -> list[str]:
-        """Return warnings about the Range messages so far; empty if there is no suspicion."""
-        return [*self.limits.warnings(), *self.missing.warnings()]
+        """Return warnings about the messages so far; empty if there is no suspicion."""
+        return [*swapped_frames(self.map_frame, self.base_frame), *self.limits.warnings(), *self.missing.warnings()]
 
     def rejection_warnings(self) -> list[str]:
-        """Return warnings about the readings that were rejected so far; empty if they are few."""
+        """Return warnings about the readings and poses that were rejected so far; empty if they are few."""
         return [
+            *odometry_rejections(self.odometry_rejected, self.odometry_received, MANY_REJECTED),
             *rejection_warnings(self.rejected, self.received),
             *sensor_rejections(self.rejected_by_frame, self.buffer.counts()),
         ]
@@ -195,9 +205,10 @@ class PoseAssociator(MessageAccount):
         `parameters` are those of the new maps.
         """
         self._all_parameters = parameters or self._all_parameters
+        # that of the next drive may have others, if its driver starts after the reset
+        self._frames_forgettable = True
         if self._other_frame:
-            self.map_frame = self.base_frame = ''
-            self._history.clear()
+            self._forget_frames()
         elif self._history.newest is not None:
             # the clock may begin anew, and the next reading may have a stamp of the drive that is forgotten
             self._history.forget_before(self._history.newest - JUMP)
@@ -226,16 +237,18 @@ class PoseAssociator(MessageAccount):
         if not (message.frame_id + message.child_frame_id).isprintable():
             self.odometry_rejected['unprintable_frame_id'] += 1
             return
+        known = self.map_frame.lstrip('/'), self.base_frame.lstrip('/')
+        other = (message.frame_id.lstrip('/'), message.child_frame_id.lstrip('/')) != known
+        if other and self._frames_forgettable:
+            self._forget_frames()
+            self.record.begin_anew()
         if not self.map_frame and not self.base_frame:
             self.map_frame, self.base_frame = message.frame_id, message.child_frame_id
-        if (message.frame_id.lstrip('/'), message.child_frame_id.lstrip('/')) != (
-            self.map_frame.lstrip('/'),
-            self.base_frame.lstrip('/'),
-        ):
+        elif other:
             self.odometry_rejected['other_frame'] += 1
             self._other_frame = True
             return
-        self._other_frame = False
+        self._other_frame = self._frames_forgettable = False
         self.extend_path(message.pose[:2])
         order = order_of(message.stamp, self._history.newest, self._history.before)
         if order == WAS_AHEAD:
@@ -291,6 +304,11 @@ class PoseAssociator(MessageAccount):
     def extend_path(self, point: tuple[float, float]) -> None:
         """Add a point to the path of the robot, if it is far enough from the last one."""
         self._path.extend(point)
+
+    def _forget_frames(self) -> None:
+        """Forget the frames of odometry, and the poses in them."""
+        self.map_frame = self.base_frame = ''
+        self._history.clear()
 
     def _drop_stamp_ahead(self) -> None:
         """Drop the newest pose, whose stamp was ahead of those before and after it; readings placed by it stay."""

@@ -124,6 +124,9 @@ ODOMETRY_REASONS = {
 """Why an odometry message is rejected, in words."""
 
 
+OF_ROBOTS, OF_FLOORS = ('base_link', 'base_footprint'), ('odom', 'map')
+"""Usual names of frames of robots, and of fixed frames."""
+
 NEAREST = 0.001
 """Smallest valid range, metres: drivers of dead sensors send less."""
 
@@ -208,6 +211,29 @@ def rejection_warnings(
         f'{count} of {judged} {what} were rejected as {reason}: {REASONS[reason]}'
         for reason, count in rejected.items()
         if count > MANY_REJECTED * judged and reason not in known and reason != PAUSED
+    ]
+
+
+def swapped_frames(frame_id: str, child_frame_id: str) -> list[str]:
+    """Return a warning if usual names of the frames of odometry are swapped, or none; a name may have a prefix."""
+    fixed, moving = (frame.rpartition('/')[2] for frame in (frame_id, child_frame_id))
+    if fixed not in OF_ROBOTS and moving not in OF_FLOORS:
+        return []
+    return [
+        f'odometry has frame_id {frame_id} and child_frame_id {child_frame_id or "(none)"}: the first must be the '
+        'fixed frame, such as odom, and the second that of the robot, such as base_link (REP 105); correct its '
+        'driver, otherwise the maps are in the wrong frame'
+    ]
+
+
+def odometry_rejections(
+    rejected: Mapping[str, int], received: int, least: float = 0.0, what: str = 'odometry messages'
+) -> list[str]:
+    """Return a warning for each reason for which more than a fraction `least` of odometry was rejected."""
+    return [
+        f'{count} of {received} {what} were rejected: {ODOMETRY_REASONS[reason]}'
+        for reason, count in rejected.items()
+        if count > least * received
     ]
 
 

@@ -683,6 +683,47 @@ def test_reset_with_another_odometry_frame_starts_again() -> None:
     assert (p.map_frame, len(p.buffer)) == ('odom', 1)
 
 
+@pytest.mark.parametrize(
+    ('frame', 'child', 'wrong'),
+    [
+        ('odom', 'base_link', False),
+        ('map', 'base_footprint', False),
+        ('odom_combined', '', False),
+        ('', '', False),
+        ('base_link', 'odom', True),
+        ('/robot1/base_footprint', 'robot1/odom', True),
+        ('base_link', '', True),
+        ('odom', 'odom', True),
+        ('base_link', 'base_link', True),
+    ],
+)
+def test_swapped_frames_of_odometry_are_named(frame: str, child: str, wrong: bool) -> None:
+    p = associator()
+    p.add_odometry(odometry(1.0)._replace(frame_id=frame, child_frame_id=child))
+    warnings = p.message_warnings()
+    assert len(warnings) == wrong
+    if wrong:
+        assert f'odometry has frame_id {frame} and child_frame_id {child or "(none)"}' in warnings[0]
+
+
+def test_odometry_in_another_frame_may_begin_after_a_reset() -> None:
+    p = associator()
+    for second in (1.0, 1.5):
+        p.add_odometry(odometry(second)._replace(frame_id='base_link', child_frame_id='odom'))
+    p.add_range(sonar(1.2))
+    p.clear()
+    # the driver is started again after the reset, corrected
+    p.add_range(sonar(2.2))
+    for second in (2.0, 2.5):
+        p.add_odometry(odometry(second, x=30.0))
+    assert (p.map_frame, p.base_frame, p.buffer.stored, p.odometry_rejected) == ('odom', 'base_link', 1, {})
+    # the drive before is no part of it
+    assert p.odometry[1][:, 0].tolist() == [30.0, 30.0]
+    # a drive that has begun keeps its frames
+    p.add_odometry(odometry(3.0)._replace(frame_id='other'))
+    assert p.odometry_rejected == {'other_frame': 1}
+
+
 def test_reset_with_another_odometry_frame_forgets_the_clock() -> None:
     clock = Clock()
     p = associator(clock=clock)
