@@ -331,6 +331,17 @@ def test_few_readings_may_have_a_period_at_random() -> None:
     assert alternating(101)
 
 
+def test_an_echo_that_comes_and_goes_has_no_period() -> None:
+    """Half of the time the sensor passes a wall that it hears at random, so that a quarter of the ranges change."""
+    count = 1000
+    for seed in range(20):
+        heard = np.random.default_rng(seed).random(count) < 0.5
+        z = np.where(heard & (np.arange(count) < 0.52 * count), 2.0, 5.0)
+        x, stamp = 0.05 * np.arange(count), np.arange(count) * 10**8 + 7 * 10**6
+        ranges = Readings.from_columns(('sonar',), x=x, y=0.0, yaw=0.0, z=z, z_max=5.0, half_angle=0.13, stamp=stamp)
+        assert not any('alternate like' in text for text in input_warnings(ranges)), seed
+
+
 @pytest.mark.parametrize(('sensors', 'warns'), [(6, True), (LONGEST_PERIOD, True), (LONGEST_PERIOD + 1, False)])
 def test_rings_of_up_to_32_sensors_with_one_frame_are_detected(sensors: int, warns: bool) -> None:
     k, wide = np.arange(20 * sensors), np.random.default_rng(2).permutation(sensors)
