@@ -131,10 +131,13 @@ class TrialMap(NamedTuple):
         That of the maximum likelihood map, nats; -inf if the map would be too large.
     blocks : float64, shape (BLOCKS,)
         The log-likelihoods of blocks of successive readings, nats.
+    echoes : float
+        The log-likelihood of the echoes alone, nats.
     """
 
     objective: float
     blocks: Floats
+    echoes: float
 
 
 def randomly_thinned(readings: Readings, most: int) -> Readings:
@@ -165,6 +168,8 @@ def trial_map(readings: Readings, parameters: Parameters) -> TrialMap:
     evidence = Evidence(grid, parameters.model, memory_for_pairs(parameters), search.threads or cores())
     evidence.extend(readings)
     found = Search(evidence, search, traversed_cells(readings, grid).ravel()).run(lambda progress: None)
-    each = evidence.log_likelihoods[np.argsort(readings.stamp, kind='stable')]
-    blocks = np.array([block.sum() for block in np.array_split(each, BLOCKS)])
-    return TrialMap(float(evidence.tempered_log_likelihood + found.log_prior), blocks)
+    each = evidence.log_likelihoods
+    by_time = each[np.argsort(readings.stamp, kind='stable')]
+    blocks = np.array([block.sum() for block in np.array_split(by_time, BLOCKS)])
+    objective = float(evidence.tempered_log_likelihood + found.log_prior)
+    return TrialMap(objective, blocks, float(each[readings.echo].sum()))
