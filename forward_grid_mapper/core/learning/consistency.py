@@ -3,7 +3,8 @@
 Such faults cause no error message, only a wrong map. Each of them can be undone: mirrored sensors are mirrored back,
 stamps are shifted back. So a small map of a part of the drive is made for each assumed fault, with the fault undone,
 and compared with the map of the unchanged readings. If the input is sound, none of them explains the readings better.
-Small offsets, of stamps or of the poses of the sensors, are then estimated from a longer part (`sensor_calibration`).
+Small offsets, of stamps or of the poses of the sensors, and a scale of ranges are then estimated from a longer part
+(`sensor_calibration`).
 
 Ranges that are too large by a factor look like odometry that is too small by it.
 
@@ -28,6 +29,7 @@ from .sensor_calibration import (
     FORWARD,
     LEFT,
     QUANTITIES,
+    SCALE,
     TIME,
     YAW,
     OffsetEstimate,
@@ -151,6 +153,11 @@ def _offset_warning(found: list[OffsetEstimate], time_offset: float) -> str:
                 f'set the parameter range_time_offset to {time_offset + each.value:.2f}, or correct the drivers, which '
                 'must stamp a reading at the time of its measurement, all by the same clock'
             )
+        elif each.quantity is SCALE:
+            remedies.append(
+                'correct the speed of sound in the drivers of the sensors (343 m/s at 20 °C), or the wheel radius in '
+                'that of odometry'
+            )
         elif CHECK not in remedies:
             remedies.append(CHECK)
     remedy = '; or '.join(remedies)
@@ -164,6 +171,9 @@ def _words(quantity: Quantity, value: float, error: float) -> str:
     if quantity is TIME:
         word = 'late' if value < 0 else 'early'
         return f'the stamps of the readings are {size:.2f} s (±{error:.2f} s) too {word} against those of odometry'
+    if quantity is SCALE:
+        word = 'long' if value > 0 else 'short'
+        return f'ranges are {size:.0%} (±{100 * error:.1f}) too {word} for the distances of odometry'
     if quantity is YAW:
         size, error, side = math.degrees(size), math.degrees(error), 'left' if value > 0 else 'right'
         return f'the sensors are rotated by {size:.0f} degrees (±{error:.1f}) to the {side} of their stated poses'

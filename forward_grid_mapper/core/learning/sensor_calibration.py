@@ -1,4 +1,4 @@
-"""Calibration of all sensors together: the time offset of their stamps, and their common pose on the robot.
+"""Calibration of all sensors together: time offset of their stamps, common pose on the robot, and scale of ranges.
 
 Only the right value makes readings from different places, in different directions and at different speeds agree with
 one map. So a small map is made for each of a few values, and the value of the largest objective J is looked for. Near
@@ -69,7 +69,10 @@ FORWARD = Quantity((-0.15, 0.15), 0.05, lambda drive, value: drive.moved(forward
 LEFT = Quantity((-0.15, 0.15), 0.05, lambda drive, value: drive.moved(left=value))
 """Translation of all sensors on the robot, metres."""
 
-QUANTITIES = (TIME, YAW, FORWARD, LEFT)
+SCALE = Quantity((-0.12, -0.05, 0.05, 0.12), 0.02, lambda drive, value: drive.scaled(1.0 + value))
+"""By which part of itself a distance driven is longer than odometry says, so that ranges are too long for it."""
+
+QUANTITIES = (TIME, YAW, FORWARD, LEFT, SCALE)
 
 
 class OffsetEstimate(NamedTuple):

@@ -115,6 +115,11 @@ class MountedReadings:
         """Return the readings with all sensors moved on the robot, metres, and each turned on the spot, radians."""
         return self.placed(extrinsics=self.extrinsics + np.array([[forward], [left], [turn]]))
 
+    def scaled(self, factor: float) -> Readings:
+        """Return the readings as if the robot drove that much farther, from the same place."""
+        x, y, yaw = self.robot
+        return self.placed(robot=np.stack([x[0] + factor * (x - x[0]), y[0] + factor * (y - y[0]), yaw]))
+
     def rotated(self, angle: float) -> Readings:
         """Return the readings with all sensors rotated about the origin of the robot's frame, radians."""
         forward, left, turn = self.extrinsics

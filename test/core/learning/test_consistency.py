@@ -151,6 +151,14 @@ SCENARIOS: dict[str, tuple[Callable[[Messages], Messages], str]] = {
         lambda m: m.mounted(turned(-12)),
         r'sensors are rotated by 1[0-4] degrees \(±\d\.\d\) to the left of their stated poses; check the poses',
     ),
+    'ranges a tenth too long': (
+        lambda m: m._replace(ranges=[r._replace(range=1.1 * r.range) for r in m.ranges]),
+        r'ranges are (9|10|11)% \(±\d\.\d\) too long for the distances of odometry; correct the speed of sound',
+    ),
+    'wheels stated a tenth too large': (
+        lambda m: m.driven(lambda p: Pose2(1.1 * p.x, 1.1 * p.y, p.yaw)),
+        r'ranges are (8|9|10)% \(±\d\.\d\) too short for the distances of odometry.*or the wheel radius',
+    ),
     'sensors stated too far forward': (
         lambda m: m.mounted(lambda p: Pose2(p.x + 0.2, p.y, p.yaw)),
         r'the sensors are 0\.(1[6-9]|2[0-4]) m \(±0\.0\d m\) behind their stated poses',
@@ -205,6 +213,7 @@ def test_wrong_poses_give_one_warning_with_the_cause(name: str) -> None:
         (consistency.TIME, 'are 0.10 s (±0.01 s) too early', 'are 0.10 s (±0.01 s) too late'),
         (consistency.YAW, 'by 6 degrees (±0.6) to the left of', 'by 6 degrees (±0.6) to the right of'),
         (consistency.FORWARD, 'are 0.10 m (±0.01 m) forward of', 'are 0.10 m (±0.01 m) behind'),
+        (consistency.SCALE, 'ranges are 10% (±1.0) too long', 'ranges are 10% (±1.0) too short'),
         (consistency.LEFT, 'are 0.10 m (±0.01 m) to the left of', 'are 0.10 m (±0.01 m) to the right of'),
     ],
 )
