@@ -280,6 +280,15 @@ def test_ranges_are_compared_with_max_range_as_a_parameter() -> None:
     assert 'are the ranges in centimetres and the limits in metres' in warning
 
 
+def test_unit_of_a_sensor_that_seldom_has_an_echo_is_found() -> None:
+    rng = np.random.default_rng(0)
+    frame = sorted(circling().extrinsics)[2]
+    quiet = circling().with_ranges(lambda m: m._replace(range=m.range if rng.random() < 0.2 else math.inf))
+    assert associated(*quiet).message_warnings() == []
+    (warning,) = associated(*of_one(quiet, 100)).message_warnings()
+    assert re.search(f'sensor {frame}: .* are the ranges in centimetres', warning), warning
+
+
 def test_limits_in_the_wrong_order_are_no_question_of_units() -> None:
     """The readings are rejected as bad_limits, which is said elsewhere."""
     swapped = drive().with_ranges(lambda m: m._replace(min_range=m.max_range, max_range=m.min_range))
