@@ -168,7 +168,7 @@ def trial_map(readings: Readings, parameters: Parameters) -> TrialMap:
     try:
         grid = map_grid(readings, parameters)
     except InputError:
-        return TrialMap(-math.inf, np.zeros(BLOCKS))
+        return TrialMap(-math.inf, np.zeros(BLOCKS), 0.0)
     search = parameters.search
     evidence = Evidence(grid, parameters.model, memory_for_pairs(parameters), search.threads or cores())
     evidence.extend(readings)
