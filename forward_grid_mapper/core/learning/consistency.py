@@ -36,6 +36,7 @@ from .sensor_calibration import (
     Quantity,
     hardly_distinguishable,
     offset_estimates,
+    sigmas,
 )
 from .trial_maps import MountedReadings, coarse_parameters, trial_map
 
@@ -54,6 +55,10 @@ than other faults."""
 
 LEAST_GUESS_GAIN = 12.0
 """Nats that the best guess of an offset must gain for the offset to be estimated."""
+
+LONGER_GAIN, LONGER_SIGMAS = 0.05, 4.0
+"""If wrong signs or axes gain as much, but less than `LEAST_GAIN_A_READING`, the longer part decides: few sensors, most
+of them without an echo, tell little in a short one. Nats a reading and, over blocks of readings, standard errors."""
 
 FACTORS = (0.3048, 0.5, 2.0, 3.281)
 """Scale factors of odometry that are tried: feet for metres, and radius for diameter of a wheel, and their inverses."""
@@ -117,10 +122,26 @@ def consistency_warnings(
     tried = ((trial_map(fault.undone, p).objective - given, fault) for fault in _faults(part))
     gain, fault = max(tried, key=itemgetter(0))
     known = gain / count if gain >= max(fault.least * count, LEAST_TOTAL_GAIN) else 0.0
+    if not known and gain >= LEAST_GUESS_GAIN:
+        gain, count = _over_longer_part(drive, fault.warning, parameters)
+        known = gain / count
     found = _significant_offsets(drive, parameters, known)
     if found and found[0].gain > known * found[0].readings:
         return [_offset_warning(found, parameters.association.range_time_offset)]
     return [_explained(fault.warning, count, gain)] if known else []
+
+
+def _over_longer_part(drive: MountedReadings, warning: str, parameters: Parameters) -> tuple[float, int]:
+    """Return the gain of wrong signs or axes over the longer part, nats, and its readings; 0 if not significant."""
+    part = drive.moving_part(OFFSET_PART)
+    undone = [fault.undone for fault in _axis_faults(part) if fault.warning == warning]
+    if not undone:
+        return 0.0, len(part)
+    p = coarse_parameters(parameters, part.readings)
+    given, better = trial_map(part.readings, p), trial_map(undone[0], p)
+    gain = better.objective - given.objective
+    sure = gain >= max(LONGER_GAIN * len(part), LEAST_TOTAL_GAIN)
+    return gain if sure and sigmas(better.blocks - given.blocks) >= LONGER_SIGMAS else 0.0, len(part)
 
 
 def _significant_offsets(drive: MountedReadings, parameters: Parameters, known: float) -> list[OffsetEstimate]:

@@ -25,7 +25,7 @@ from forward_grid_mapper.core.mapping import Mapper
 from forward_grid_mapper.core.messages.message_types import NANOSECONDS, OdometryMessage, Pose2, RangeMessage
 from forward_grid_mapper.files.quality_warning import quality_warning
 from forward_grid_mapper.simulation.drive import Recording, building_drive, corridor_drive, door_drive, drive
-from forward_grid_mapper.simulation.sonar import NOISE_FREE, NOISY, front_array, sonar_ring
+from forward_grid_mapper.simulation.sonar import NOISE_FREE, NOISY, SonarArray, front_array, sonar_ring
 from forward_grid_mapper.simulation.world import rooms_world
 from samples import associated
 
@@ -326,6 +326,39 @@ def test_offsets_are_measured_on_a_recording(
     # the readings are placed by wrong poses of the sensors
     (warning,) = consistency_warnings(change(drive), extrinsics)
     assert re.search(expected, warning), warning
+
+
+def swapped_sides(readings: Readings, extrinsics: dict[str, Pose2]) -> list[str]:
+    """The warnings about readings that are placed with left and right of the sensors swapped."""
+    drive = MountedReadings.of(readings, extrinsics)
+    forward, left, turn = drive.extrinsics
+    wrong = {name: Pose2(pose.x, -pose.y, -pose.yaw) for name, pose in extrinsics.items()}
+    return consistency_warnings(drive.placed(extrinsics=np.stack([forward, -left, -turn])), wrong)
+
+
+def test_swapped_sides_are_found_if_a_short_part_tells_little() -> None:
+    """Three sensors, of whose readings most have no echo."""
+    three = SonarArray((0.0, math.pi / 2, -math.pi / 2), 0.1, math.radians(25.0), 4.0, 0.1)
+    made = building_drive(0, 1, NOISY, True, three)
+    silent = np.random.default_rng(0).random(len(made.readings)) < 0.6
+    readings = dataclasses.replace(made.readings, z=np.where(silent, made.readings.z_max, made.readings.z))
+    extrinsics = dict(made.extrinsics)
+    assert consistency_warnings(readings, extrinsics) == []
+    (warning,) = swapped_sides(readings, extrinsics)
+    assert 'left and right of the sensors seem to be swapped' in warning
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize('name', ['office_a', 'office_b'])
+def test_swapped_sides_are_found_on_a_recording(shared: Path, name: str) -> None:
+    from forward_grid_mapper.recordings.read_drive import read_drive
+
+    bag = shared / 'data' / name / 'bag'
+    if not bag.exists():
+        pytest.skip(f'{bag} is not there')
+    found = read_drive(bag, Parameters(), {}, None, '/odom_corrected')
+    (warning,) = swapped_sides(found.associator.readings, found.source['extrinsics'])
+    assert 'left and right of the sensors seem to be swapped' in warning
 
 
 @pytest.mark.slow
