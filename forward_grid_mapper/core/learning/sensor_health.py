@@ -48,7 +48,7 @@ SHORT_WITHIN = 0.5
 MISSED_WITHIN = 0.75
 """A max-range reading is missed if there is an obstacle within this fraction of max range."""
 LEAST_READINGS = 30
-"""A sensor with fewer readings is not judged."""
+"""A sensor with fewer readings is not judged, and one with fewer echoes not by their random part."""
 LEAST_SHARE_OF_OTHERS = 0.1
 """Nor is one with less than this fraction of the median number of the others."""
 DEAF_NO_ECHO, DEAF_MISSED = 0.95, 0.2
@@ -224,10 +224,11 @@ def _table(
     near: Sequence[tuple[int, float]],
 ) -> dict[str, SensorHealth]:
     """Return the table from counts by sensor, shape (S,), and `commonest_range` of each and of its short readings."""
-    with np.errstate(invalid='ignore'):
+    with np.errstate(divide='ignore', invalid='ignore'):
         shares: dict[str, Floats] = {kind: counts[kind] / numbers for kind in FRACTIONS}
         shares |= {kind: counts[kind] / counts['places'] for kind in ('places_random', 'places_short')}
-        shares['of_echoes'] = counts['random'] / (numbers - counts['no_echo'])
+        echoes = numbers - counts['no_echo']
+        shares['of_echoes'] = np.where(echoes >= LEAST_READINGS, counts['random'] / echoes, np.nan)
         shares['same'] = np.array([held for held, _ in common], np.float64) / numbers
         shares['alike'] = np.array([held for held, _ in near], np.float64) / counts['short']
     made = {}
@@ -328,10 +329,9 @@ def _verdict(number: int, usual: float, mine: dict[str, float], others: dict[str
     if min(mine['short'], mine['places_short']) >= SUSPECT_SHORT and repeats and above('short'):
         return 'always short'
     random = min(mine['random'], mine['places_random'])
-    often = math.isfinite(others['random']) and (
-        (random >= SUSPECT_RANDOM_WITH_OTHERS and above('random'))
-        or (random >= LEAST_RANDOM and mine['of_echoes'] >= SUSPECT_OF_ECHOES and above('of_echoes'))
-    )
+    often = random >= SUSPECT_RANDOM_WITH_OTHERS and math.isfinite(others['random']) and above('random')
+    if random >= LEAST_RANDOM and mine['of_echoes'] >= SUSPECT_OF_ECHOES:
+        often = often or (math.isfinite(others['of_echoes']) and above('of_echoes'))
     if (often or mine['random'] >= SUSPECT_RANDOM) and mine['short'] >= PERSON_SHORT_SHARE * mine['random']:
         return 'something moves near it'
     if random >= SUSPECT_RANDOM and above('random'):
