@@ -40,9 +40,9 @@ FEWEST_RETURNS = 4
 FEW_RANDOM = 0.05
 """Random part of the echoes up to which the halves of a drive are not compared, which takes a second."""
 
-LEAST_CONTRADICTION = 0.035
-"""Least contradiction of the halves of a drive, nats an echo, for a warning; it is up to 0.03 in most sound drives, and
-0.04 in one around small columns, but 0.04 as well in one that is off by metres."""
+LEAST_CONTRADICTION = 0.03
+"""Least contradiction of the halves of a drive, nats an echo, for a warning; it is up to 0.025 in nearly all sound
+drives, and from 0.04 on in most that are off by half a metre or more."""
 
 
 def data_warnings(maps: MapSet, source: Mapping[str, Any]) -> list[str]:

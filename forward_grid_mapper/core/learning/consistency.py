@@ -3,7 +3,8 @@
 Such faults cause no error message, only a wrong map. Each of them can be undone: mirrored sensors are mirrored back,
 stamps are shifted back. So a small map of a part of the drive is made for each assumed fault, with the fault undone,
 and compared with the map of the unchanged readings. If the input is sound, none of them explains the readings better.
-Small offsets, of stamps or of the poses of the sensors, are then estimated from a longer part (`sensor_calibration`).
+Small offsets, of stamps or of the poses of the sensors, and a scale of ranges are then estimated from a longer part
+(`sensor_calibration`).
 
 Ranges that are too large by a factor look like odometry that is too small by it.
 
@@ -28,12 +29,14 @@ from .sensor_calibration import (
     FORWARD,
     LEFT,
     QUANTITIES,
+    SCALE,
     TIME,
     YAW,
     OffsetEstimate,
     Quantity,
     hardly_distinguishable,
     offset_estimates,
+    sigmas,
 )
 from .trial_maps import MountedReadings, coarse_parameters, trial_map
 
@@ -52,6 +55,10 @@ than other faults."""
 
 LEAST_GUESS_GAIN = 12.0
 """Nats that the best guess of an offset must gain for the offset to be estimated."""
+
+LONGER_GAIN, LONGER_SIGMAS = 0.05, 4.0
+"""If wrong signs or axes gain as much, but less than `LEAST_GAIN_A_READING`, the longer part decides: few sensors, most
+of them without an echo, tell little in a short one. Nats a reading and, over blocks of readings, standard errors."""
 
 FACTORS = (0.3048, 0.5, 2.0, 3.281)
 """Scale factors of odometry that are tried: feet for metres, and radius for diameter of a wheel, and their inverses."""
@@ -115,10 +122,26 @@ def consistency_warnings(
     tried = ((trial_map(fault.undone, p).objective - given, fault) for fault in _faults(part))
     gain, fault = max(tried, key=itemgetter(0))
     known = gain / count if gain >= max(fault.least * count, LEAST_TOTAL_GAIN) else 0.0
+    if not known and gain >= LEAST_GUESS_GAIN:
+        gain, count = _over_longer_part(drive, fault.warning, parameters)
+        known = gain / count
     found = _significant_offsets(drive, parameters, known)
     if found and found[0].gain > known * found[0].readings:
         return [_offset_warning(found, parameters.association.range_time_offset)]
     return [_explained(fault.warning, count, gain)] if known else []
+
+
+def _over_longer_part(drive: MountedReadings, warning: str, parameters: Parameters) -> tuple[float, int]:
+    """Return the gain of wrong signs or axes over the longer part, nats, and its readings; 0 if not significant."""
+    part = drive.moving_part(OFFSET_PART)
+    undone = [fault.undone for fault in _axis_faults(part) if fault.warning == warning]
+    if not undone:
+        return 0.0, len(part)
+    p = coarse_parameters(parameters, part.readings)
+    given, better = trial_map(part.readings, p), trial_map(undone[0], p)
+    gain = better.objective - given.objective
+    sure = gain >= max(LONGER_GAIN * len(part), LEAST_TOTAL_GAIN)
+    return gain if sure and sigmas(better.blocks - given.blocks) >= LONGER_SIGMAS else 0.0, len(part)
 
 
 def _significant_offsets(drive: MountedReadings, parameters: Parameters, known: float) -> list[OffsetEstimate]:
@@ -151,6 +174,11 @@ def _offset_warning(found: list[OffsetEstimate], time_offset: float) -> str:
                 f'set the parameter range_time_offset to {time_offset + each.value:.2f}, or correct the drivers, which '
                 'must stamp a reading at the time of its measurement, all by the same clock'
             )
+        elif each.quantity is SCALE:
+            remedies.append(
+                'correct the speed of sound in the drivers of the sensors (343 m/s at 20 °C), or the wheel radius in '
+                'that of odometry'
+            )
         elif CHECK not in remedies:
             remedies.append(CHECK)
     remedy = '; or '.join(remedies)
@@ -164,6 +192,9 @@ def _words(quantity: Quantity, value: float, error: float) -> str:
     if quantity is TIME:
         word = 'late' if value < 0 else 'early'
         return f'the stamps of the readings are {size:.2f} s (±{error:.2f} s) too {word} against those of odometry'
+    if quantity is SCALE:
+        word = 'long' if value > 0 else 'short'
+        return f'ranges are {size:.0%} (±{100 * error:.1f}) too {word} for the distances of odometry'
     if quantity is YAW:
         size, error, side = math.degrees(size), math.degrees(error), 'left' if value > 0 else 'right'
         return f'the sensors are rotated by {size:.0f} degrees (±{error:.1f}) to the {side} of their stated poses'

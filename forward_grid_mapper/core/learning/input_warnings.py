@@ -39,6 +39,11 @@ neighbours. Upper quartiles are compared, since some readings are random."""
 NEIGHBOUR_DIFFERENCE = 0.3
 """Metres by which the ranges of neighbouring sensors differ in at least a quarter of the cases; less may be noise."""
 
+REPEAT_SHARE = 0.5
+"""One round of sensors apart, ranges differ by that much at most this often, relative to those of neighbours. An echo
+that comes and goes may change a quarter of the ranges from one to the next, and by chance a little fewer some readings
+apart, so that the quartiles are far from each other."""
+
 LARGEST_TURN = 0.05
 """Steps between readings during which the sensor turned by more, radians, are ignored: a sensor on a servo, or on a
 robot that spins, detects the same objects periodically. So are steps in which it moved by more than
@@ -143,9 +148,11 @@ def _shared_frame(readings: Readings) -> str:
         steps = np.abs(np.diff(z))[one_pose]
         neighbours = float(np.quantile(steps, 0.75)) if len(steps) else 0.0
         periods = range(3, min(LONGEST_PERIOD, len(z) // 10) + 1)
-        rounds = [float(np.quantile(np.abs(z[k:] - z[:-k]), 0.75)) for k in periods]
+        most = REPEAT_SHARE * float(np.mean(steps > NEIGHBOUR_DIFFERENCE)) if len(steps) else 0.0
         takes_turns = (
-            len(steps) >= LEAST_PAIRS and neighbours > NEIGHBOUR_DIFFERENCE and min(rounds) < REPEAT_RATIO * neighbours
+            len(steps) >= LEAST_PAIRS
+            and neighbours > NEIGHBOUR_DIFFERENCE
+            and any(_repeats(np.abs(z[k:] - z[:-k]), REPEAT_RATIO * neighbours, most) for k in periods)
         )
         if at_once or takes_turns:
             suspects.append(name)
@@ -156,6 +163,11 @@ def _shared_frame(readings: Readings) -> str:
         'same frame_id? Set a different one for each in its driver, with its pose; otherwise all readings are mapped '
         'from the same pose'
     )
+
+
+def _repeats(differences: Floats, quartile: float, most: float) -> bool:
+    """Return whether ranges that are some readings apart differ as little as those of one sensor."""
+    return bool(np.quantile(differences, 0.75) < quartile and np.mean(differences > NEIGHBOUR_DIFFERENCE) <= most)
 
 
 def _speed(readings: Readings) -> str:

@@ -1,4 +1,4 @@
-"""Calibration of all sensors together: the time offset of their stamps, and their common pose on the robot.
+"""Calibration of all sensors together: time offset of their stamps, common pose on the robot, and scale of ranges.
 
 Only the right value makes readings from different places, in different directions and at different speeds agree with
 one map. So a small map is made for each of a few values, and the value of the largest objective J is looked for. Near
@@ -69,7 +69,10 @@ FORWARD = Quantity((-0.15, 0.15), 0.05, lambda drive, value: drive.moved(forward
 LEFT = Quantity((-0.15, 0.15), 0.05, lambda drive, value: drive.moved(left=value))
 """Translation of all sensors on the robot, metres."""
 
-QUANTITIES = (TIME, YAW, FORWARD, LEFT)
+SCALE = Quantity((-0.12, -0.05, 0.05, 0.12), 0.02, lambda drive, value: drive.scaled(1.0 + value))
+"""By which part of itself a distance driven is longer than odometry says, so that ranges are too long for it."""
+
+QUANTITIES = (TIME, YAW, FORWARD, LEFT, SCALE)
 
 
 class OffsetEstimate(NamedTuple):
@@ -100,8 +103,8 @@ class OffsetEstimate(NamedTuple):
 
     def gained_by(self, best: TrialMap, given: TrialMap) -> OffsetEstimate:
         """Return the estimate with the gain of one map, made with its value, over another, made without."""
-        gain, sigmas = best.objective - given.objective, _sigmas(best.blocks - given.blocks)
-        return self._replace(best=best, gain=gain, sigmas=sigmas)
+        gain = best.objective - given.objective
+        return self._replace(best=best, gain=gain, sigmas=sigmas(best.blocks - given.blocks))
 
     @property
     def significant(self) -> bool:
@@ -137,7 +140,7 @@ def offset_estimates(
 
 def hardly_distinguishable(best: OffsetEstimate, other: OffsetEstimate) -> bool:
     """Return whether the drive hardly tells which of two quantities is wrong: at constant speed, late is behind."""
-    return other.gain >= AS_GOOD_SHARE * best.gain or _sigmas(best.best.blocks - other.best.blocks) < SIGMAS - 1
+    return other.gain >= AS_GOOD_SHARE * best.gain or sigmas(best.best.blocks - other.best.blocks) < SIGMAS - 1
 
 
 def _estimate(
@@ -172,7 +175,7 @@ def _estimate(
         (best + offset) * step,
         math.hypot(error, GRID_ERROR_STEPS) * step,
         found.objective - given.objective,
-        _sigmas(found.blocks - given.blocks),
+        sigmas(found.blocks - given.blocks),
         len(part),
         found,
     )
@@ -185,7 +188,7 @@ def _on_best_cells(readings: Readings, known: TrialMap, parameters: Parameters) 
     return max((known, *(trial_map(each, parameters) for each in moved)), key=lambda each: each.objective)
 
 
-def _sigmas(gains: Floats) -> float:
+def sigmas(gains: Floats) -> float:
     """Return the sum of gains of blocks in its standard errors."""
     error = math.sqrt(len(gains) * float(np.var(gains, ddof=1)))
     return float(gains.sum()) / error if error else 0.0

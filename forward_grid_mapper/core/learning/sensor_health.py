@@ -17,6 +17,9 @@ along it meet its walls at a slant and get no echo, while those at the sides hea
 A parked robot repeats a range for as long as it stands, so the fractions of the places with such readings must be
 suspect as well.
 
+Only echoes can be random. A sensor that seldom has one may have a wrong pose although few of its readings are random,
+so the fraction of its echoes counts as well.
+
 Fractions are compared with those of the other sensors, since all have no echoes in a hall of smooth walls, and all have
 random ones in a crowd. A fraction is suspect if it is large *and* well above the median of the others.
 """
@@ -45,7 +48,7 @@ SHORT_WITHIN = 0.5
 MISSED_WITHIN = 0.75
 """A max-range reading is missed if there is an obstacle within this fraction of max range."""
 LEAST_READINGS = 30
-"""A sensor with fewer readings is not judged."""
+"""A sensor with fewer readings is not judged, and one with fewer echoes not by their random part."""
 LEAST_SHARE_OF_OTHERS = 0.1
 """Nor is one with less than this fraction of the median number of the others."""
 DEAF_NO_ECHO, DEAF_MISSED = 0.95, 0.2
@@ -59,6 +62,9 @@ SUSPECT_RANDOM = 0.5
 SUSPECT_RANDOM_WITH_OTHERS = 0.3
 """A sensor with others to compare with is suspect from this fraction of random readings on: if its pose is wrong, the
 walls along which the robot drives still explain many."""
+SUSPECT_OF_ECHOES, LEAST_RANDOM = 0.4, 0.1
+"""A sensor is suspect from the first fraction of random echoes on as well, if at least the second one of its readings
+is random: a sensor that has hardly any echo hears the random ones above all."""
 SUSPECT_SAME, WINDOW = 0.8, 0.2
 """A sensor that repeats one range has at least this fraction of its readings, or of its short readings, within this
 many metres: it may hear its robot only now and then."""
@@ -218,9 +224,11 @@ def _table(
     near: Sequence[tuple[int, float]],
 ) -> dict[str, SensorHealth]:
     """Return the table from counts by sensor, shape (S,), and `commonest_range` of each and of its short readings."""
-    with np.errstate(invalid='ignore'):
+    with np.errstate(divide='ignore', invalid='ignore'):
         shares: dict[str, Floats] = {kind: counts[kind] / numbers for kind in FRACTIONS}
         shares |= {kind: counts[kind] / counts['places'] for kind in ('places_random', 'places_short')}
+        echoes = numbers - counts['no_echo']
+        shares['of_echoes'] = np.where(echoes >= LEAST_READINGS, counts['random'] / echoes, np.nan)
         shares['same'] = np.array([held for held, _ in common], np.float64) / numbers
         shares['alike'] = np.array([held for held, _ in near], np.float64) / counts['short']
     made = {}
@@ -320,14 +328,13 @@ def _verdict(number: int, usual: float, mine: dict[str, float], others: dict[str
     repeats = max(mine['same'], mine['alike']) >= SUSPECT_SAME
     if min(mine['short'], mine['places_short']) >= SUSPECT_SHORT and repeats and above('short'):
         return 'always short'
-    often = (
-        min(mine['random'], mine['places_random']) >= SUSPECT_RANDOM_WITH_OTHERS
-        and math.isfinite(others['random'])
-        and above('random')
-    )
+    random = min(mine['random'], mine['places_random'])
+    often = random >= SUSPECT_RANDOM_WITH_OTHERS and math.isfinite(others['random']) and above('random')
+    if random >= LEAST_RANDOM and mine['of_echoes'] >= SUSPECT_OF_ECHOES:
+        often = often or (math.isfinite(others['of_echoes']) and above('of_echoes'))
     if (often or mine['random'] >= SUSPECT_RANDOM) and mine['short'] >= PERSON_SHORT_SHARE * mine['random']:
         return 'something moves near it'
-    if min(mine['random'], mine['places_random']) >= SUSPECT_RANDOM and above('random'):
+    if random >= SUSPECT_RANDOM and above('random'):
         return 'mostly random'
     return 'often random' if often else 'ok'
 

@@ -115,6 +115,11 @@ class MountedReadings:
         """Return the readings with all sensors moved on the robot, metres, and each turned on the spot, radians."""
         return self.placed(extrinsics=self.extrinsics + np.array([[forward], [left], [turn]]))
 
+    def scaled(self, factor: float) -> Readings:
+        """Return the readings as if the robot drove that much farther, from the same place."""
+        x, y, yaw = self.robot
+        return self.placed(robot=np.stack([x[0] + factor * (x - x[0]), y[0] + factor * (y - y[0]), yaw]))
+
     def rotated(self, angle: float) -> Readings:
         """Return the readings with all sensors rotated about the origin of the robot's frame, radians."""
         forward, left, turn = self.extrinsics
@@ -131,10 +136,13 @@ class TrialMap(NamedTuple):
         That of the maximum likelihood map, nats; -inf if the map would be too large.
     blocks : float64, shape (BLOCKS,)
         The log-likelihoods of blocks of successive readings, nats.
+    echoes : float
+        The log-likelihood of the echoes alone, nats.
     """
 
     objective: float
     blocks: Floats
+    echoes: float
 
 
 def randomly_thinned(readings: Readings, most: int) -> Readings:
@@ -160,11 +168,13 @@ def trial_map(readings: Readings, parameters: Parameters) -> TrialMap:
     try:
         grid = map_grid(readings, parameters)
     except InputError:
-        return TrialMap(-math.inf, np.zeros(BLOCKS))
+        return TrialMap(-math.inf, np.zeros(BLOCKS), 0.0)
     search = parameters.search
     evidence = Evidence(grid, parameters.model, memory_for_pairs(parameters), search.threads or cores())
     evidence.extend(readings)
     found = Search(evidence, search, traversed_cells(readings, grid).ravel()).run(lambda progress: None)
-    each = evidence.log_likelihoods[np.argsort(readings.stamp, kind='stable')]
-    blocks = np.array([block.sum() for block in np.array_split(each, BLOCKS)])
-    return TrialMap(float(evidence.tempered_log_likelihood + found.log_prior), blocks)
+    each = evidence.log_likelihoods
+    by_time = each[np.argsort(readings.stamp, kind='stable')]
+    blocks = np.array([block.sum() for block in np.array_split(by_time, BLOCKS)])
+    objective = float(evidence.tempered_log_likelihood + found.log_prior)
+    return TrialMap(objective, blocks, float(each[readings.echo].sum()))

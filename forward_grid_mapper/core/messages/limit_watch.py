@@ -7,6 +7,9 @@ sensors together, since most robots have one driver for all, and if there is no 
 
 from __future__ import annotations
 
+import math
+from typing import Any
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -16,7 +19,8 @@ from .message_types import RangeMessage
 from .sensor_records import record_of
 
 SAMPLES = 256
-"""Most messages of a sensor that are sampled; they are spread over the whole drive."""
+"""Most messages of a sensor that are sampled; they are spread over the whole drive. Those that tell nothing about units
+are left out: a sensor may seldom have an echo."""
 
 LEAST_MESSAGES = 30
 """Fewest messages for a check."""
@@ -109,7 +113,8 @@ class LimitWatch:
             limit = message.max_range
             if given:
                 limit = max(limit, given) if limit < LONGEST_RANGE else given
-            samples.add(message.range, message.min_range, limit)
+            if _usable(message.range, message.min_range, limit):
+                samples.add(message.range, message.min_range, limit)
 
     def add_all(self, messages: Ranges, given: float = 0.0) -> None:
         """Apply `add` to many messages."""
@@ -117,17 +122,20 @@ class LimitWatch:
         if given:
             limits = np.where(limits < LONGEST_RANGE, np.maximum(limits, given), given)
         values = np.stack([messages.range, messages.min_range, limits], axis=1)
+        usable = _usable(*values.T)
         for frame, part in messages.of_each():
             if samples := record_of(self._of, frame, _Samples):
-                samples.add_all(values[part])
+                samples.add_all(values[part][usable[part]])
 
     def warnings(self) -> list[str]:
         """Return warnings; empty if there is no suspicion."""
         if not self._of:
             return []
         values = [samples.values for samples in self._of.values()]
-        sensor = np.repeat(np.arange(len(values)), [len(of_one) for of_one in values])
-        if of_all := _suspicion(np.concatenate(values), sensor):
+        counts = [len(of_one) for of_one in values]
+        # if only one of several has ranges, there are none to compare with
+        alone = len(values) > 1 and np.count_nonzero(counts) == 1
+        if of_all := _suspicion(np.concatenate(values), None if alone else np.repeat(np.arange(len(values)), counts)):
             return [of_all]
         found = {frame: _suspicion(samples.values) for frame, samples in sorted(self._of.items())}
         return [f'sensor {frame}: {suspicion}' for frame, suspicion in found.items() if suspicion]
@@ -139,18 +147,15 @@ class LimitWatch:
         A map with such a limit takes minutes, and shows nothing but the error.
         """
         values = np.concatenate([np.empty((0, 3)), *(samples.values for samples in self._of.values())])
-        finite = values[_usable(values)].T
-        if len(finite[0]) < LEAST_MESSAGES or _middle(finite[2]) >= LARGEST_STATED:
+        if len(values) < LEAST_MESSAGES or _middle(values[:, 2]) >= LARGEST_STATED:
             return ''
-        return _limits_too_large(finite)
+        return _limits_too_large(values.T)
 
 
-def _usable(values: Floats) -> NDArray[np.bool_]:
-    """Return which messages have a range and limits that do not contradict each other, shape (N,)."""
-    ranges, least, limits = values.T
-    stated = (limits > 0) & (limits < np.inf) & (least <= limits)
-    usable: NDArray[np.bool_] = np.isfinite(ranges) & (ranges > 0) & stated
-    return usable
+def _usable(ranges: Any, least: Any, limits: Any) -> Any:
+    """Return whether messages have a range and limits that do not contradict each other; of numbers or arrays."""
+    # NaN is never smaller
+    return (ranges > 0) & (ranges < math.inf) & (limits > 0) & (limits < math.inf) & (least <= limits)
 
 
 def _suspicion(values: Floats, sensor: NDArray[np.int64] | None = None) -> str:
@@ -163,15 +168,9 @@ def _suspicion(values: Floats, sensor: NDArray[np.int64] | None = None) -> str:
     sensor : int64, shape (N,), optional
         The sensor of each, if they are those of all sensors.
     """
-    used = _usable(values)
-    if np.count_nonzero(used) < LEAST_MESSAGES:
+    if len(values) < LEAST_MESSAGES:
         return ''
-    finite = values[used].T
-    if sensor is not None:
-        several = sensor.max() > 0
-        sensor = sensor[used]
-        # the others have no ranges to compare with
-        sensor = None if several and np.ptp(sensor) == 0 else sensor
+    finite = values.T
     # one cause has several symptoms; the first that is reported is enough
     return _larger_than_limits(finite, sensor) or _limits_too_large(finite) or _smaller_than_limits(finite, sensor)
 

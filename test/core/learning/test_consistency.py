@@ -25,7 +25,7 @@ from forward_grid_mapper.core.mapping import Mapper
 from forward_grid_mapper.core.messages.message_types import NANOSECONDS, OdometryMessage, Pose2, RangeMessage
 from forward_grid_mapper.files.quality_warning import quality_warning
 from forward_grid_mapper.simulation.drive import Recording, building_drive, corridor_drive, door_drive, drive
-from forward_grid_mapper.simulation.sonar import NOISE_FREE, NOISY, front_array, sonar_ring
+from forward_grid_mapper.simulation.sonar import NOISE_FREE, NOISY, SonarArray, front_array, sonar_ring
 from forward_grid_mapper.simulation.world import rooms_world
 from samples import associated
 
@@ -151,6 +151,14 @@ SCENARIOS: dict[str, tuple[Callable[[Messages], Messages], str]] = {
         lambda m: m.mounted(turned(-12)),
         r'sensors are rotated by 1[0-4] degrees \(±\d\.\d\) to the left of their stated poses; check the poses',
     ),
+    'ranges a tenth too long': (
+        lambda m: m._replace(ranges=[r._replace(range=1.1 * r.range) for r in m.ranges]),
+        r'ranges are (9|10|11)% \(±\d\.\d\) too long for the distances of odometry; correct the speed of sound',
+    ),
+    'wheels stated a tenth too large': (
+        lambda m: m.driven(lambda p: Pose2(1.1 * p.x, 1.1 * p.y, p.yaw)),
+        r'ranges are (8|9|10)% \(±\d\.\d\) too short for the distances of odometry.*or the wheel radius',
+    ),
     'sensors stated too far forward': (
         lambda m: m.mounted(lambda p: Pose2(p.x + 0.2, p.y, p.yaw)),
         r'the sensors are 0\.(1[6-9]|2[0-4]) m \(±0\.0\d m\) behind their stated poses',
@@ -205,6 +213,7 @@ def test_wrong_poses_give_one_warning_with_the_cause(name: str) -> None:
         (consistency.TIME, 'are 0.10 s (±0.01 s) too early', 'are 0.10 s (±0.01 s) too late'),
         (consistency.YAW, 'by 6 degrees (±0.6) to the left of', 'by 6 degrees (±0.6) to the right of'),
         (consistency.FORWARD, 'are 0.10 m (±0.01 m) forward of', 'are 0.10 m (±0.01 m) behind'),
+        (consistency.SCALE, 'ranges are 10% (±1.0) too long', 'ranges are 10% (±1.0) too short'),
         (consistency.LEFT, 'are 0.10 m (±0.01 m) to the left of', 'are 0.10 m (±0.01 m) to the right of'),
     ],
 )
@@ -317,6 +326,39 @@ def test_offsets_are_measured_on_a_recording(
     # the readings are placed by wrong poses of the sensors
     (warning,) = consistency_warnings(change(drive), extrinsics)
     assert re.search(expected, warning), warning
+
+
+def swapped_sides(readings: Readings, extrinsics: dict[str, Pose2]) -> list[str]:
+    """The warnings about readings that are placed with left and right of the sensors swapped."""
+    drive = MountedReadings.of(readings, extrinsics)
+    forward, left, turn = drive.extrinsics
+    wrong = {name: Pose2(pose.x, -pose.y, -pose.yaw) for name, pose in extrinsics.items()}
+    return consistency_warnings(drive.placed(extrinsics=np.stack([forward, -left, -turn])), wrong)
+
+
+def test_swapped_sides_are_found_if_a_short_part_tells_little() -> None:
+    """Three sensors, of whose readings most have no echo."""
+    three = SonarArray((0.0, math.pi / 2, -math.pi / 2), 0.1, math.radians(25.0), 4.0, 0.1)
+    made = building_drive(0, 1, NOISY, True, three)
+    silent = np.random.default_rng(0).random(len(made.readings)) < 0.6
+    readings = dataclasses.replace(made.readings, z=np.where(silent, made.readings.z_max, made.readings.z))
+    extrinsics = dict(made.extrinsics)
+    assert consistency_warnings(readings, extrinsics) == []
+    (warning,) = swapped_sides(readings, extrinsics)
+    assert 'left and right of the sensors seem to be swapped' in warning
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize('name', ['office_a', 'office_b'])
+def test_swapped_sides_are_found_on_a_recording(shared: Path, name: str) -> None:
+    from forward_grid_mapper.recordings.read_drive import read_drive
+
+    bag = shared / 'data' / name / 'bag'
+    if not bag.exists():
+        pytest.skip(f'{bag} is not there')
+    found = read_drive(bag, Parameters(), {}, None, '/odom_corrected')
+    (warning,) = swapped_sides(found.associator.readings, found.source['extrinsics'])
+    assert 'left and right of the sensors seem to be swapped' in warning
 
 
 @pytest.mark.slow

@@ -57,3 +57,26 @@ def test_few_readings_or_none_with_an_echo_say_nothing(there_and_back: Readings)
     assert contradiction(silent, Parameters()) == 0.0
     assert contradiction(there_and_back.select(slice(300)), Parameters()) == 0.0
     assert contradiction(there_and_back.select(slice(0)), Parameters()) == 0.0
+
+
+def test_things_that_are_heard_from_one_side_only_are_no_contradiction() -> None:
+    """On the way back they return nothing: their other side is smooth, and at a slant."""
+    k = np.arange(2400)
+    back = k >= 1200
+    x = np.where(back, 24.0 - 0.02 * (k - 1200), 0.02 * k)
+    # looks at things a metre away, a third of the way, and at a wall in between
+    thing = (k % 2 == 0) & (np.remainder(x, 1.5) < 0.5)
+    wall = k % 2 == 1
+    z = np.where(wall, 1.5, np.where(thing & ~back, 1.0, 4.0))
+    readings = Readings.from_columns(
+        ('left', 'right'),
+        x=x,
+        y=np.where(back, 2.0, 0.0),
+        yaw=np.where(wall ^ back, -math.pi / 2, math.pi / 2),
+        z=z,
+        z_max=4.0,
+        half_angle=0.2,
+        sensor=wall.astype(np.int32),
+        stamp=k * 10**8,
+    )
+    assert contradiction(readings, Parameters()) < 0.02

@@ -280,6 +280,15 @@ def test_ranges_are_compared_with_max_range_as_a_parameter() -> None:
     assert 'are the ranges in centimetres and the limits in metres' in warning
 
 
+def test_unit_of_a_sensor_that_seldom_has_an_echo_is_found() -> None:
+    rng = np.random.default_rng(0)
+    frame = sorted(circling().extrinsics)[2]
+    quiet = circling().with_ranges(lambda m: m._replace(range=m.range if rng.random() < 0.2 else math.inf))
+    assert associated(*quiet).message_warnings() == []
+    (warning,) = associated(*of_one(quiet, 100)).message_warnings()
+    assert re.search(f'sensor {frame}: .* are the ranges in centimetres', warning), warning
+
+
 def test_limits_in_the_wrong_order_are_no_question_of_units() -> None:
     """The readings are rejected as bad_limits, which is said elsewhere."""
     swapped = drive().with_ranges(lambda m: m._replace(min_range=m.max_range, max_range=m.min_range))
@@ -329,6 +338,17 @@ def test_few_readings_may_have_a_period_at_random() -> None:
 
     assert not alternating(100)
     assert alternating(101)
+
+
+def test_an_echo_that_comes_and_goes_has_no_period() -> None:
+    """Half of the time the sensor passes a wall that it hears at random, so that a quarter of the ranges change."""
+    count = 1000
+    for seed in range(20):
+        heard = np.random.default_rng(seed).random(count) < 0.5
+        z = np.where(heard & (np.arange(count) < 0.52 * count), 2.0, 5.0)
+        x, stamp = 0.05 * np.arange(count), np.arange(count) * 10**8 + 7 * 10**6
+        ranges = Readings.from_columns(('sonar',), x=x, y=0.0, yaw=0.0, z=z, z_max=5.0, half_angle=0.13, stamp=stamp)
+        assert not any('alternate like' in text for text in input_warnings(ranges)), seed
 
 
 @pytest.mark.parametrize(('sensors', 'warns'), [(6, True), (LONGEST_PERIOD, True), (LONGEST_PERIOD + 1, False)])

@@ -49,7 +49,7 @@ def explained(monkeypatch: pytest.MonkeyPatch) -> Callable[[Callable[[float, flo
     def by(objective: Callable[[float, float], float]) -> None:
         def made(readings: Readings, parameters: Parameters) -> TrialMap:
             value = objective(float(readings.x.mean()), float(readings.y.mean()))
-            return TrialMap(value, (1.0 + NOISE) * value / BLOCKS)
+            return TrialMap(value, (1.0 + NOISE) * value / BLOCKS, 0.0)
 
         monkeypatch.setattr(sensor_calibration, 'trial_map', made)
 
@@ -102,8 +102,8 @@ def test_late_is_as_good_as_behind_at_constant_speed(explained) -> None:
 
 def test_clearly_worse_quantity_is_no_rival() -> None:
     nothing = np.zeros(BLOCKS)
-    best = OffsetEstimate(TIME, 0.2, 0.01, 500.0, 9.0, 4000, TrialMap(0.0, nothing + 12.5 + NOISE))
-    other = OffsetEstimate(FORWARD, 0.2, 0.01, 300.0, 6.0, 4000, TrialMap(0.0, nothing + 7.5))
+    best = OffsetEstimate(TIME, 0.2, 0.01, 500.0, 9.0, 4000, TrialMap(0.0, nothing + 12.5 + NOISE, 0.0))
+    other = OffsetEstimate(FORWARD, 0.2, 0.01, 300.0, 6.0, 4000, TrialMap(0.0, nothing + 7.5, 0.0))
     assert not hardly_distinguishable(best, other)
     assert hardly_distinguishable(best, other._replace(gain=450.0))
     assert hardly_distinguishable(best, other._replace(best=best.best))

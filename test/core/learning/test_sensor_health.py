@@ -302,3 +302,17 @@ def test_sensor_with_far_fewer_readings_than_the_others_has_no_verdict() -> None
     rare = readings.select(np.concatenate([np.repeat(others, 3), mine[: LEAST_READINGS + 1]]))
     assert LEAST_READINGS < np.count_nonzero(rare.sensor == 8) < LEAST_SHARE_OF_OTHERS * 3 * usual
     assert sensor_health(mapped(rare))['sonar_08'].verdict == 'few readings'
+
+
+def test_sensor_with_a_wrong_pose_is_named_if_most_readings_have_no_echo() -> None:
+    readings = rooms(front=True)
+    silent = np.random.default_rng(3).random(len(readings)) < 0.7
+    readings = dataclasses.replace(readings, z=np.where(silent, readings.z_max, readings.z))
+    assert suspects(readings) == {}
+    turned = readings.yaw + np.where(readings.sensor == 3, math.radians(90.0), 0.0)
+    maps = mapped(dataclasses.replace(readings, yaw=turned))
+    table = sensor_health(maps)
+    assert {name: row.verdict for name, row in table.items() if row.suspect} == {'sonar_03': 'often random'}
+    assert table['sonar_03'].random < 0.3
+    counts = health_counts(maps.readings, maps.forward_model(), maps.ml, maps.unexplained)
+    assert health_of_counts(readings.sensor_names, counts)['sonar_03'].verdict == 'often random'
