@@ -14,7 +14,18 @@ import numpy as np
 
 from ..common.readings import Floats
 from .attempt import Attempt, Drive, gain_words
-from .holding_out import EVERY, LEAST_SIGMAS, Gain, gain, has_revisits, held_out, held_out_blocks, predicted
+from .holding_out import (
+    EVERY,
+    LEAST_SIGMAS,
+    Gain,
+    gain,
+    has_revisits,
+    held_out,
+    held_out_blocks,
+    predicted,
+    tears_apart,
+)
+from .judging import MOST_WORSE_NEARBY, SPAN
 
 OTHERS = (0, 2)
 """The first held-out window of each further fold; in the first fold it is `EVERY` // 2."""
@@ -35,32 +46,47 @@ def accepted_in_folds(drive: Drive, first: Attempt, solve: Callable[[Drive], Att
     solve : callable
         Returns the attempt at a drive with other windows held out.
     """
-    revisited = has_revisits(drive.scans, first.nodes)
-    if has_revisits(drive.scans, drive.windows.node) and not revisited:
-        # it contradicts itself nowhere, so readings are predicted better along it even if it is wrong
+    if tears_apart(drive.scans, drive.windows.node, first.nodes):
         return None
-    before, after = [np.empty(0)], [np.empty(0)]
-
-    def compared(here: Drive, nodes: Floats) -> Gain:
-        blocks = held_out_blocks(here.scans, len(nodes))
-        before.append(predicted(here.scans, here.windows.node, blocks))
-        after.append(predicted(here.scans, nodes, blocks))
-        return gain(np.concatenate(before), np.concatenate(after))
-
-    better, found = compared(drive, first.nodes), [first]
+    revisited = has_revisits(drive.scans, first.nodes)
+    found, all_visits, nearby = [first], _Compared(np.inf), _Compared(SPAN)
+    all_visits.add(drive, first.nodes)
+    nearby.add(drive, first.nodes)
     for begin in OTHERS:
-        if better.sigmas < NEARLY:
+        if all_visits.gain.sigmas < NEARLY:
             return None
         other = drive.with_held_out(held_out(len(drive.windows), begin))
         attempt = solve(other)
         if not attempt.refinement.accepted or has_revisits(drive.scans, attempt.nodes) != revisited:
             return None
-        better = compared(other, attempt.nodes)
+        all_visits.add(other, attempt.nodes)
+        nearby.add(other, attempt.nodes)
         found.append(attempt)
-        if better.sigmas >= LEAST_SIGMAS:
+        if nearby.gain.sigmas < -MOST_WORSE_NEARBY:
+            return None
+        if all_visits.gain.sigmas >= LEAST_SIGMAS:
             best = max(found, key=lambda each: drive.scans.objective(each.nodes))
-            return _with_gain(best, better, len(found))
+            return _with_gain(best, all_visits.gain, len(found))
     return None
+
+
+class _Compared:
+    """Predictions of the held-out windows of several folds, by odometry and by trajectories, on maps within `span`."""
+
+    def __init__(self, span: float) -> None:
+        self._span = span
+        self._before, self._after = [np.empty(0)], [np.empty(0)]
+
+    def add(self, drive: Drive, nodes: Floats) -> None:
+        """Add a fold: its drive, and the nodes of its trajectory, shape (K, 3)."""
+        blocks = held_out_blocks(drive.scans, len(nodes))
+        self._before.append(predicted(drive.scans, drive.windows.node, blocks, self._span))
+        self._after.append(predicted(drive.scans, nodes, blocks, self._span))
+
+    @property
+    def gain(self) -> Gain:
+        """The gain of the trajectories over odometry."""
+        return gain(np.concatenate(self._before), np.concatenate(self._after))
 
 
 def _with_gain(attempt: Attempt, better: Gain, folds: int) -> Attempt:

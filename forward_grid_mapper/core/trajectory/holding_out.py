@@ -137,3 +137,11 @@ def has_revisits(scans: Scans, nodes: Floats) -> bool:
         near = np.hypot(*(nodes[:, :2] - nodes[k, :2]).T) < NEAR
         count += bool((near & (np.abs(progress - progress[k]) > REVISIT_AFTER)).any())
     return count >= FEWEST_BLOCKS
+
+
+def tears_apart(scans: Scans, before: Floats, after: Floats) -> bool:
+    """Return whether the robot comes back to places along the nodes `before`, and to none along `after`.
+
+    Such a trajectory contradicts itself nowhere, so readings are predicted better along it even if it is wrong.
+    """
+    return has_revisits(scans, before) and not has_revisits(scans, after)

@@ -27,6 +27,11 @@ JUDGED_ON, HELD_OUT = 60, 40
 MOST_WORSE = 1.0
 """Standard errors by which a trajectory may predict readings worse and is still not called worse."""
 
+MOST_WORSE_NEARBY = 2.0
+"""Standard errors by which a trajectory may predict readings worse within a few metres and still be accepted. With
+corridors that are wrongly taken for straight ones it is 2 to 16, even if readings are predicted much better where the
+robot came back."""
+
 FIRST, FEWEST_FIRST, CLEAR = 3, 12, 2.0
 """One block of this many is compared first, if these are so many; the others only if the gain of all blocks is not
 expected to be beyond the thresholds by this many σ. A local map for each block takes most of the time."""

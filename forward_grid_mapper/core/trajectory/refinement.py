@@ -27,8 +27,8 @@ from .after_jumps import Part, begins_of, parts_at, with_doubtful
 from .any_angle import match_drive
 from .attempt import ACCURACY, EXACT, Attempt, Drive, gain_words, refined
 from .certainty import LARGEST_SIGMA, yaw_errors
-from .holding_out import LEAST_SIGMAS, Gain, has_revisits, held_out
-from .judging import gain_at_revisits, gain_of_objective, gain_within_visits
+from .holding_out import LEAST_SIGMAS, Gain, has_revisits, held_out, tears_apart
+from .judging import MOST_WORSE_NEARBY, gain_at_revisits, gain_of_objective, gain_within_visits
 from .jumps import MOST_JUMPS, jumps, without_outliers
 from .local_map import for_matching
 from .odometry_model import CALIBRATION
@@ -48,6 +48,8 @@ NOR_MATCHES = '; scan matching alone gives no better trajectory'
 SCAN_MATCHED = 2 * TRAVEL
 """Largest median distance between poses of odometry for matching alone, metres. Scan matching takes the shape of two
 windows from odometry, and between poses readings are interpolated on a straight line, so turns are lost."""
+
+WORSE_NEARBY = '; with scan matching alone, readings within a few metres are predicted worse than with odometry'
 
 Watch = Callable[[str, float], None]
 """Receives the name of the stage, and the fraction of it that is done, from 0 to 1."""
@@ -154,10 +156,11 @@ class Refiner:
         better = gain_at_revisits(scans, windows.node, nodes, self._start_stage('judgement'))
         if better.sigmas < LEAST_SIGMAS:
             return _without_better(by_walls.refinement)
-        if not confirmed_by_places(scans, nodes, found.loops):
-            within = gain_within_visits(scans, windows.node, nodes, self._start_stage('judgement'))
-            if within.sigmas < LEAST_SIGMAS:
-                return _without_better(by_walls.refinement, unconfirmed_words(found.part))
+        within = gain_within_visits(scans, windows.node, nodes, self._start_stage('judgement'))
+        if not confirmed_by_places(scans, nodes, found.loops) and within.sigmas < LEAST_SIGMAS:
+            return _without_better(by_walls.refinement, unconfirmed_words(found.part))
+        if within.sigmas < -MOST_WORSE_NEARBY:
+            return _without_better(by_walls.refinement, WORSE_NEARBY)
         if known is None and (walls := self._by_walls_after_all(drive, by_walls, nodes, least)) is not None:
             return walls
         at_revisits = 'where the robot came back, ' if has_revisits(scans, nodes) else ''
@@ -193,8 +196,7 @@ class Refiner:
             by_walls = at_right_angles(drive, noise, least, self._start_stage, odometry_is_wrong=True)
         if by_walls is None or not by_walls.refinement.accepted:
             return None
-        if has_revisits(drive.scans, nodes) and not has_revisits(drive.scans, by_walls.nodes):
-            # it would be better in both comparisons, because it contradicts itself nowhere
+        if tears_apart(drive.scans, nodes, by_walls.nodes):
             return None
         for compared in (gain_at_revisits, gain_of_objective):
             try:

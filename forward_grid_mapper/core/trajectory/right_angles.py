@@ -9,13 +9,22 @@ from typing import NamedTuple
 
 import numpy as np
 
+from ..common.errors import InputError
 from ..common.readings import Floats
 from .attempt import ACCURACY, EXACT, Attempt, Drive, gain_words, refined
 from .folds import accepted_in_folds
 from .heading import NOISES, Heading, heading
-from .holding_out import FEWEST_BLOCKS, LEAST_SIGMAS, Gain, has_revisits
+from .holding_out import FEWEST_BLOCKS, LEAST_SIGMAS, Gain, has_revisits, tears_apart
 from .hypotheses import Solved, solve_hypotheses
-from .judging import gain_at_revisits, gain_over_drive, last_not_worse, turns_supported
+from .judging import (
+    MOST_WORSE_NEARBY,
+    gain_at_revisits,
+    gain_of_objective,
+    gain_over_drive,
+    gain_within_visits,
+    last_not_worse,
+    turns_supported,
+)
 from .loops import Loop
 from .odometry_model import CALIBRATION
 from .outcome import Differences, Refinement, differences, replaced
@@ -159,7 +168,8 @@ def at_right_angles(
         return _unproven(drive, walls, verdict)
     if (proven := proven_in_folds(drive, attempt, odometry_noise, start_stage)) is not None:
         return proven
-    return _unproven(drive, walls, verdict)._replace(unproven=attempt, start=attempt.nodes)
+    start = None if tears_apart(drive.scans, drive.windows.node, attempt.nodes) else attempt.nodes
+    return _unproven(drive, walls, verdict)._replace(unproven=attempt, start=start)
 
 
 def proven_in_folds(
@@ -275,15 +285,20 @@ def _at_revisits(drive: Drive, walls: _AlongWalls, best: _Candidate, watch: Prog
     places by odometry and to none along the refined nodes: the walls of a corridor around a hall can be taken for
     straight ones. If it comes back along the refined nodes, votes suffice if the places are recognised.
     """
-    revisited, by_odometry = (has_revisits(drive.scans, nodes) for nodes in (best.nodes, drive.windows.node))
-    if not revisited and (not walls.votes_suffice or by_odometry):
+    revisited = has_revisits(drive.scans, best.nodes)
+    if not revisited and (not walls.votes_suffice or tears_apart(drive.scans, drive.windows.node, best.nodes)):
         return walls.verdict
     better = gain_at_revisits(drive.scans, drive.windows.node, best.nodes, watch)
     words = gain_words(better)
     if revisited:
-        words = f'where the robot came back, {words}'
-        if better.sigmas >= LEAST_SIGMAS or not (walls.votes_suffice and _is_recognised(drive.scans, best)):
-            return _Verdict(better.sigmas >= LEAST_SIGMAS, better, words)
+        words, proven = f'where the robot came back, {words}', better.sigmas >= LEAST_SIGMAS
+        nearby = gain_within_visits(drive.scans, drive.windows.node, best.nodes, watch)
+        if nearby.sigmas < -MOST_WORSE_NEARBY:
+            return _Verdict(False, better, f'{words}, but not within a few metres')
+        if not proven and nearby.sigmas >= LEAST_SIGMAS and better.sigmas >= LEAST_SIGMAS_WITH_WALLS:
+            return _Verdict(True, nearby, f'within a few metres, {gain_words(nearby)}')
+        if proven or not (walls.votes_suffice and _is_recognised(drive.scans, best)):
+            return _Verdict(proven, better, words)
     if better.sigmas < LEAST_SIGMAS_WITH_WALLS:
         return _Verdict(False, better, words)
     likelier = f'the readings are more likely by {walls.vote_gain:.0f} nats than with odometry'
@@ -315,7 +330,17 @@ def _accepted(drive: Drive, best: _Candidate, verdict: _Verdict, noise: float, l
         noise=noise,
     )
     sure = recognised_part(scans, best.nodes, best.loops) >= LEAST_RECOGNISED and turns_supported(scans, best.nodes)
+    sure = sure and not (verdict.by_votes and _is_contradicted(drive, best.nodes))
     return Attempt(outcome, best.nodes, sure, verdict.by_votes)
+
+
+def _is_contradicted(drive: Drive, nodes: Floats) -> bool:
+    """Return whether J is clearly smaller than with odometry, although the trajectory was fitted to the readings."""
+    try:
+        return gain_of_objective(drive.scans, drive.windows.node, nodes).sigmas <= -LEAST_SIGMAS
+    except InputError:
+        # the map along this trajectory is too large
+        return True
 
 
 def _by_name(calibration: Floats) -> dict[str, float]:

@@ -7,7 +7,7 @@ import pytest
 from numpy.typing import NDArray
 
 from forward_grid_mapper.core.common.readings import Floats
-from forward_grid_mapper.core.trajectory import folds
+from forward_grid_mapper.core.trajectory import folds, holding_out
 from forward_grid_mapper.core.trajectory.attempt import Attempt, Drive
 from forward_grid_mapper.core.trajectory.folds import NEARLY, OTHERS, accepted_in_folds
 from forward_grid_mapper.core.trajectory.holding_out import EVERY, LEAST_SIGMAS, held_out
@@ -27,15 +27,21 @@ class Folds:
     sigmas : list of float
     back : list of bool, optional
         Whether odometry, then each solution, comes back to places.
+    nearby : float
+        Standard errors by which each solution predicts readings better within a few metres.
     """
 
-    def __init__(self, monkeypatch, scans: Scans, sigmas: list[float], back: list[bool] | None = None) -> None:
+    def __init__(
+        self, monkeypatch, scans: Scans, sigmas: list[float], back: list[bool] | None = None, nearby: float = 0.0
+    ) -> None:
         self.held_out: list[NDArray[np.bool_]] = []
+        self._nearby = nearby
         self._sigmas, self._back = sigmas, back or [True] * (1 + len(sigmas))
         windows = scans.windows
         self.drive = Drive(windows.readings, None, windows, scans)  # type: ignore[arg-type]
         monkeypatch.setattr(folds, 'predicted', self.predicted)
-        monkeypatch.setattr(folds, 'has_revisits', lambda scans, nodes: self._back[self._number(nodes)])
+        for module in (folds, holding_out):
+            monkeypatch.setattr(module, 'has_revisits', lambda scans, nodes: self._back[self._number(nodes)])
         monkeypatch.setattr(Scans, 'objective', lambda scans, nodes: float(nodes[0, 0]))
 
     def _number(self, nodes: Floats) -> int:
@@ -50,14 +56,15 @@ class Folds:
         self.held_out.append(other.scans.held_out)
         return self.attempt(1 + len(self.held_out))
 
-    def predicted(self, scans: Scans, nodes: Floats, blocks: list[NDArray[np.int64]]) -> Floats:
+    def predicted(self, scans: Scans, nodes: Floats, blocks: list[NDArray[np.int64]], span: float) -> Floats:
         assert all(scans.held_out[block].all() for block in blocks)
         number, count = self._number(nodes), len(blocks)
         if not number:
             return np.zeros(count)
         noise = np.tile([1.0, -1.0], count)[:count]
         noise -= noise.mean()
-        return noise + self._sigmas[number - 1] * noise.std(ddof=1) / np.sqrt(count)
+        sigmas = self._sigmas[number - 1] if np.isinf(span) else self._nearby
+        return noise + sigmas * noise.std(ddof=1) / np.sqrt(count)
 
     def judged(self) -> Attempt | None:
         return accepted_in_folds(self.drive, self.attempt(1), self.solve)
@@ -113,6 +120,13 @@ def test_readings_of_other_held_out_windows_are_not_used(scans) -> None:
 @pytest.mark.parametrize('back', [[True, False, False], [True, True, False]])
 def test_trajectories_that_come_back_to_other_places_are_no_proof(scans, monkeypatch, back: list[bool]) -> None:
     assert Folds(monkeypatch, scans, [ENOUGH, ENOUGH], back).judged() is None
+
+
+@pytest.mark.parametrize(('nearby', 'accepted'), [(-1.3, True), (-1.5, False)])
+def test_readings_nearby_must_not_be_predicted_worse(scans, monkeypatch, nearby: float, accepted: bool) -> None:
+    # in two folds, -1.4 standard errors are -2 together
+    found = Folds(monkeypatch, scans, [ENOUGH, ENOUGH], nearby=nearby).judged()
+    assert (found is not None) == accepted
 
 
 def test_fold_without_a_trajectory_is_no_proof(scans, monkeypatch) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import threading
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -11,9 +12,9 @@ import pytest
 
 from forward_grid_mapper.core.common.errors import Cancelled
 from forward_grid_mapper.core.common.parameters import Parameters
-from forward_grid_mapper.core.common.readings import Readings
+from forward_grid_mapper.core.common.readings import Floats, Readings
 from forward_grid_mapper.core.mapping import Mapper
-from forward_grid_mapper.core.trajectory import refinement, right_angles
+from forward_grid_mapper.core.trajectory import holding_out, refinement, right_angles
 from forward_grid_mapper.core.trajectory.any_angle import MatchedDrive
 from forward_grid_mapper.core.trajectory.attempt import Attempt, Drive, gain_words
 from forward_grid_mapper.core.trajectory.heading import NOISES, Drifts, Heading
@@ -28,10 +29,12 @@ from forward_grid_mapper.core.trajectory.holding_out import (
 )
 from forward_grid_mapper.core.trajectory.hypotheses import Solved
 from forward_grid_mapper.core.trajectory.outcome import Refinement
+from forward_grid_mapper.core.trajectory.pose_graph import Solution, solution_at
 from forward_grid_mapper.core.trajectory.poses import compose, relative, rms_after_alignment
 from forward_grid_mapper.core.trajectory.refinable import SHORTEST, unfit
 from forward_grid_mapper.core.trajectory.refinement import Refiner
 from forward_grid_mapper.core.trajectory.scans import Scans
+from forward_grid_mapper.core.trajectory.solving import Solver
 from forward_grid_mapper.core.trajectory.windows import Odometry, cut
 from forward_grid_mapper.simulation.drift import LEVELS, odometry_of, with_drift
 from forward_grid_mapper.simulation.drive import Recording, drive
@@ -106,7 +109,7 @@ def test_reason_of_acceptance_is_named(bent, monkeypatch, outcome) -> None:
     # at this limit the gain of predicted readings does not suffice, and no place was seen twice, so walls decide
     for module in (right_angles, refinement):
         monkeypatch.setattr(module, 'LEAST_SIGMAS', 1e9)
-    monkeypatch.setattr(right_angles, 'has_revisits', lambda *rest: False)
+    let_come_back(monkeypatch, lambda *rest: False)
     assert 'with walls at right angles, the readings are more likely by' in Refiner(Parameters()).run(*bent).reason
 
 
@@ -127,6 +130,12 @@ def no_matches(*rest) -> None:
     """Matches without information."""
 
 
+def let_come_back(monkeypatch, revisits: Callable[[Scans, Floats], bool]) -> None:
+    """Replace `has_revisits` in all modules that use it."""
+    for module in (holding_out, right_angles, refinement):
+        monkeypatch.setattr(module, 'has_revisits', revisits)
+
+
 def test_recognised_places_prove_what_nearby_readings_do_not(tour, bent, monkeypatch, solved_once) -> None:
     # wheels that are right over metres predict nearby readings better than yaws from walls do
     monkeypatch.setattr(refinement, 'match_drive', no_matches)
@@ -137,6 +146,8 @@ def test_recognised_places_prove_what_nearby_readings_do_not(tour, bent, monkeyp
     assert rms_after_alignment(found.trajectory.pose, true) < 0.2
     # the same without such places, and without walls that contradict the yaw
     monkeypatch.setattr(right_angles, 'gain_at_revisits', lambda *rest: Gain(0.0, 0.01))
+    monkeypatch.setattr(right_angles, 'gain_within_visits', lambda *rest: Gain(0.0, 0.01))
+    monkeypatch.setattr(right_angles, 'accepted_in_folds', lambda *rest: None)
     left = Refiner(Parameters()).run(*bent)
     monkeypatch.setattr(right_angles, 'LEAST_VOTE_GAIN', 1e9)
     for outcome in (left, Refiner(Parameters()).run(*bent)):
@@ -164,6 +175,7 @@ def test_walls_are_tried_again_once_matching_shows_that_odometry_is_wrong(
     monkeypatch.setattr(refinement, 'at_right_angles', at_right_angles)
     monkeypatch.setattr(refinement, 'match_drive', matched)
     monkeypatch.setattr(refinement, 'confirmed_by_places', lambda *rest: True)
+    monkeypatch.setattr(refinement, 'gain_within_visits', lambda *rest: Gain(-0.1, 0.1))
     # first that over odometry, then that over walls
     gains = iter((1.0, held_out_gain))
     monkeypatch.setattr(refinement, 'gain_at_revisits', lambda *rest: Gain(next(gains), 0.1))
@@ -173,10 +185,20 @@ def test_walls_are_tried_again_once_matching_shows_that_odometry_is_wrong(
     assert found.reason.startswith('walls; scan matching alone shows' if by_walls else 'walls are not assumed')
 
 
-@pytest.mark.parametrize(('part', 'within', 'accepted'), [(1.0, 0.1, False), (0.5, 0.2, False), (0.5, 0.3, True)])
-def test_matching_that_places_do_not_confirm_must_be_better_within_a_few_metres(
-    bent, monkeypatch, part: float, within: float, accepted: bool
+@pytest.mark.parametrize(
+    ('confirmed', 'part', 'within', 'accepted'),
+    [
+        (False, 1.0, 0.1, False),
+        (False, 0.5, 0.2, False),
+        (False, 0.5, 0.3, True),
+        (True, 1.0, -0.1, True),
+        (True, 1.0, -0.3, False),
+    ],
+)
+def test_matching_is_compared_with_odometry_within_a_few_metres(
+    bent, monkeypatch, confirmed: bool, part: float, within: float, accepted: bool
 ) -> None:
+    """It must be better if places do not confirm it, and must not be clearly worse if they do."""
     readings, odometry = bent
 
     def at_right_angles(drive: Drive, *rest, **options) -> Attempt:
@@ -188,13 +210,15 @@ def test_matching_that_places_do_not_confirm_must_be_better_within_a_few_metres(
     monkeypatch.setattr(refinement, 'at_right_angles', at_right_angles)
     monkeypatch.setattr(refinement, 'match_drive', matched)
     monkeypatch.setattr(refinement, 'gain_at_revisits', lambda *rest: Gain(1.0, 0.1))
-    monkeypatch.setattr(refinement, 'confirmed_by_places', lambda *rest: False)
+    monkeypatch.setattr(refinement, 'confirmed_by_places', lambda *rest: confirmed)
     monkeypatch.setattr(refinement, 'gain_within_visits', lambda *rest: Gain(within, 0.1))
     found = Refiner(Parameters()).run(readings, odometry)
     assert found.accepted == accepted
     expected = (
         'only 50% of the path through places seen before is' if part < 1.0 else 'hardly any of the places to which'
     )
+    if confirmed:
+        expected = 'readings within a few metres are predicted worse than with odometry'
     assert accepted or expected in found.reason
 
 
@@ -211,7 +235,8 @@ def test_walls_that_tear_apart_what_matching_brings_together_are_not_taken(bent,
     monkeypatch.setattr(refinement, 'at_right_angles', at_right_angles)
     monkeypatch.setattr(refinement, 'match_drive', matched)
     monkeypatch.setattr(refinement, 'confirmed_by_places', lambda *rest: True)
-    monkeypatch.setattr(refinement, 'has_revisits', lambda scans, nodes: bool(np.ptp(nodes[:, 0]) < 100.0))
+    let_come_back(monkeypatch, lambda scans, nodes: bool(np.ptp(nodes[:, 0]) < 100.0))
+    monkeypatch.setattr(refinement, 'gain_within_visits', lambda *rest: Gain(0.0, 0.1))
     monkeypatch.setattr(refinement, 'gain_at_revisits', lambda *rest: Gain(1.0, 0.1))
     monkeypatch.setattr(refinement, 'gain_of_objective', lambda *rest: Gain(0.0, 0.1))
     assert Refiner(Parameters()).run(readings, odometry).reason.startswith('walls are not assumed')
@@ -247,12 +272,15 @@ def test_walls_are_no_proof_if_recognised_places_do_not_confirm(bent, monkeypatc
     monkeypatch.setattr(refinement, 'match_drive', no_matches)
     monkeypatch.setattr(right_angles, 'gain_over_drive', lambda *rest: Gain(0.001, 0.01))
     monkeypatch.setattr(right_angles, 'gain_at_revisits', lambda *rest: Gain(0.001, 0.01))
+    monkeypatch.setattr(right_angles, 'gain_within_visits', lambda *rest: Gain(0.001, 0.01))
+    monkeypatch.setattr(right_angles, 'accepted_in_folds', lambda *rest: None)
+    monkeypatch.setattr(right_angles, 'confirmed_by_places', lambda *rest: False)
     left = Refiner(Parameters()).run(*bent)
     assert not left.accepted
     assert left.reason.startswith('where the robot came back, readings are predicted better than')
     assert 'does not show that odometry is wrong' in left.reason
     # if the robot visited no place twice, walls are proof, unless readings are predicted worse
-    monkeypatch.setattr(right_angles, 'has_revisits', lambda *rest: False)
+    let_come_back(monkeypatch, lambda *rest: False)
     found = Refiner(Parameters()).run(*bent)
     assert found.accepted
     assert found.reason.startswith('with walls at right angles, the readings are more likely')
@@ -262,8 +290,89 @@ def test_walls_are_no_proof_if_recognised_places_do_not_confirm(bent, monkeypatc
     assert worse.reason.startswith('readings are predicted worse than')
     # nor are they if the robot came back by odometry, but would not along walls
     monkeypatch.setattr(right_angles, 'gain_at_revisits', lambda *rest: Gain(1.0, 0.01))
-    monkeypatch.setattr(right_angles, 'has_revisits', lambda scans, nodes: nodes is scans.windows.node)
+    let_come_back(monkeypatch, lambda scans, nodes: nodes is scans.windows.node)
     assert not Refiner(Parameters()).run(*bent).accepted
+
+
+@pytest.mark.parametrize(
+    ('everywhere', 'nearby', 'places', 'accepted', 'reason'),
+    [
+        (3.0, 0.0, False, True, 'where the robot came back, readings are predicted better'),
+        # corridors that bend, taken for straight ones
+        (
+            3.0,
+            -2.1,
+            True,
+            False,
+            'where the robot came back, readings are predicted better than with odometry, by 0.030',
+        ),
+        (0.0, 2.4, False, True, 'within a few metres, readings are predicted better'),
+        (-1.1, 2.4, False, False, 'where the robot came back, readings are predicted worse'),
+        (0.0, 0.0, False, False, 'where the robot came back, readings are predicted better'),
+        # votes suffice for places that are recognised
+        (-0.9, 0.0, True, True, 'with walls at right angles, the readings are more likely'),
+        (-1.1, 0.0, True, False, 'where the robot came back, readings are predicted worse'),
+    ],
+)
+def test_trajectory_is_judged_on_maps_of_all_visits_and_nearby(
+    bent, monkeypatch, solved_once, everywhere: float, nearby: float, places: bool, accepted: bool, reason: str
+) -> None:
+    monkeypatch.setattr(refinement, 'match_drive', no_matches)
+    let_come_back(monkeypatch, lambda *rest: True)
+    monkeypatch.setattr(right_angles, 'gain_over_drive', lambda *rest: Gain(0.001, 0.01))
+    monkeypatch.setattr(right_angles, 'gain_at_revisits', lambda *rest: Gain(0.01 * everywhere, 0.01))
+    monkeypatch.setattr(right_angles, 'gain_within_visits', lambda *rest: Gain(0.01 * nearby, 0.01))
+    monkeypatch.setattr(right_angles, '_is_recognised', lambda *rest: places)
+    monkeypatch.setattr(right_angles, 'accepted_in_folds', lambda *rest: None)
+    found = Refiner(Parameters()).run(*bent)
+    assert found.accepted == accepted
+    assert found.reason.startswith(reason)
+    assert ('but not within a few metres' in found.reason) == (nearby < -2.0)
+
+
+@pytest.mark.parametrize(('gain', 'accepted'), [(-0.2, True), (-0.3, False)])
+def test_votes_do_not_suffice_if_readings_as_a_whole_contradict_them(
+    bent, monkeypatch, solved_once, gain: float, accepted: bool
+) -> None:
+    monkeypatch.setattr(refinement, 'match_drive', no_matches)
+    let_come_back(monkeypatch, lambda *rest: False)
+    monkeypatch.setattr(right_angles, 'gain_over_drive', lambda *rest: Gain(0.001, 0.01))
+    monkeypatch.setattr(right_angles, 'gain_at_revisits', lambda *rest: Gain(0.001, 0.01))
+    monkeypatch.setattr(right_angles, 'recognised_part', lambda *rest: 1.0)
+    monkeypatch.setattr(right_angles, 'turns_supported', lambda *rest: True)
+    monkeypatch.setattr(right_angles, 'accepted_in_folds', lambda *rest: None)
+    for module in (right_angles, refinement):
+        monkeypatch.setattr(module, 'gain_of_objective', lambda *rest: Gain(gain, 0.1))
+    assert Refiner(Parameters()).run(*bent).accepted == accepted
+
+
+def test_drive_is_matched_further_while_its_objective_grows(bent, monkeypatch, solved_once) -> None:
+    solved = list[Solved]()
+    monkeypatch.setattr(refinement, 'match_drive', no_matches)
+    let_come_back(monkeypatch, lambda *rest: True)
+    monkeypatch.setattr(right_angles, 'gain_over_drive', lambda *rest: Gain(0.001, 0.01))
+    monkeypatch.setattr(right_angles, 'accepted_in_folds', lambda *rest: None)
+
+    def judged(drive: Drive, walls, found: Solved, watch) -> tuple:
+        solved.append(found)
+        accepted = len(solved) == 2
+        verdict = right_angles._Verdict(accepted, Gain(0.03, 0.01), 'judged')
+        return right_angles._Candidate(found.solution.nodes, {}, found.loops), verdict
+
+    def with_matches(solver: Solver, solution: Solution) -> tuple[Solution, list]:
+        nodes = solution.nodes.copy()
+        nodes[len(nodes) // 2 :, 0] += 0.5
+        return solution_at(nodes, 4), []
+
+    monkeypatch.setattr(right_angles, '_judged', judged)
+    monkeypatch.setattr(Solver, 'with_matches', with_matches)
+    growing = iter([1.0, 2.0, 3.0, 2.5, 0.0])
+    monkeypatch.setattr(Scans, 'objective', lambda *rest: next(growing))
+    found = Refiner(Parameters()).run(*bent)
+    assert found.accepted and found.reason.startswith('judged')
+    first, further = (each.solution.nodes[-1, 0] for each in solved)
+    # J is smaller after the third time
+    assert further - first == pytest.approx(1.0)
 
 
 @pytest.mark.parametrize(
