@@ -272,9 +272,12 @@ def _heading_lost(drive: Drive, certainty: float) -> Attempt:
 def _unproven(drive: Drive, walls: _AlongWalls, verdict: _Verdict) -> Attempt:
     """Return odometry, since nothing shows that it is wrong."""
     along = refined(drive.odometry, drive.windows, walls.along.nodes)
+    off = differences(drive.odometry, along)
     # if walls agree with odometry, other methods need not be tried
-    agrees = differences(drive.odometry, along).within(ACCURACY)
-    return _kept(drive, verdict.words + NOT_ENOUGH, walls.calibration, verdict.gain.mean, agrees)
+    agrees, reason = off.within(ACCURACY), verdict.words + NOT_ENOUGH
+    if walls.vote_gain > LEAST_VOTE_GAIN and not agrees:
+        reason += f', but it is off by {off.moved:.1f} m (root mean square) if all walls are at right angles'
+    return _kept(drive, reason, walls.calibration, verdict.gain.mean, agrees)
 
 
 def _at_revisits(drive: Drive, walls: _AlongWalls, best: _Candidate, watch: Progress) -> _Verdict:

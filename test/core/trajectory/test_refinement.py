@@ -150,9 +150,12 @@ def test_recognised_places_prove_what_nearby_readings_do_not(tour, bent, monkeyp
     monkeypatch.setattr(right_angles, 'accepted_in_folds', lambda *rest: None)
     left = Refiner(Parameters()).run(*bent)
     monkeypatch.setattr(right_angles, 'LEAST_VOTE_GAIN', 1e9)
-    for outcome in (left, Refiner(Parameters()).run(*bent)):
+    without_votes = Refiner(Parameters()).run(*bent)
+    for outcome in (left, without_votes):
         assert not outcome.accepted
         assert 'does not show that odometry is wrong' in outcome.reason
+    assert 'wrong, but it is off by 0.' in left.reason
+    assert 'it is off by' not in without_votes.reason
 
 
 @pytest.mark.parametrize(
