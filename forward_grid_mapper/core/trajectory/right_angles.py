@@ -14,7 +14,7 @@ from ..common.readings import Floats
 from .attempt import ACCURACY, EXACT, Attempt, Drive, gain_words, refined
 from .folds import accepted_in_folds
 from .heading import NOISES, Heading, heading
-from .holding_out import FEWEST_BLOCKS, LEAST_SIGMAS, Gain, has_revisits, tears_apart
+from .holding_out import LEAST_SIGMAS, Gain, has_revisits, tears_apart
 from .hypotheses import Solved, solve_hypotheses
 from .judging import (
     MOST_WORSE_NEARBY,
@@ -44,6 +44,9 @@ not be predicted worse. Small drift hardly shows within a few metres."""
 
 ROUNDS = 3
 """Most times that the drive is matched again if readings do not show that odometry is wrong."""
+
+FEWEST_RECOGNISED = 3
+"""Fewest blocks on earlier visits that are recognised if votes suffice for a drive that comes back to places."""
 
 LEAST_CERTAINTY = 0.9
 """Least probability that no right angle of the heading was lost."""
@@ -310,7 +313,7 @@ def _at_revisits(drive: Drive, walls: _AlongWalls, best: _Candidate, watch: Prog
 
 def _is_recognised(scans: Scans, best: _Candidate) -> bool:
     """Return whether enough places are recognised along nodes to confirm them."""
-    return len(recognised(best.loops)) >= FEWEST_BLOCKS and confirmed_by_places(scans, best.nodes, best.loops)
+    return len(recognised(best.loops)) >= FEWEST_RECOGNISED and confirmed_by_places(scans, best.nodes, best.loops)
 
 
 def _accepted(drive: Drive, best: _Candidate, verdict: _Verdict, noise: float, least: Differences) -> Attempt:
