@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -26,7 +27,7 @@ from .passes import Progress
 from .pose_graph import solution_at
 from .poses import relative, rms_after_alignment
 from .relocating import LEAST_RECOGNISED, recognised_part
-from .scan_matching import TRUSTS, scan_matched
+from .scan_matching import TRUSTS, Trust, scan_matched
 from .scans import Scans
 from .solving import SETTLED, MatchSolver
 from .windows import Odometry
@@ -91,28 +92,31 @@ def match_drive(
     known : float64, shape (K, 3), optional
         Nodes of the trajectory from walls.
     start : float64, shape (K, 3), optional
-        Nodes from which matching starts, before scan matching is tried.
+        Nodes from which matching starts if it recognises few places from those of scan matching.
     """
     best, value = None, scans.objective(scans.windows.node)
     if known is not None:
         value = max(value, scans.objective(known))
     remaining = min(REMAINING_YAW_NOISE, noise or REMAINING_YAW_NOISE)
+
+    def scan_matched_with(trust: Trust) -> Floats:
+        return scan_matched(scans, trust._replace(yaw=noise or trust.yaw), start_stage('scan matching'))
+
+    starts: list[Callable[[], Floats]] = [partial(scan_matched_with, trust) for trust in TRUSTS]
     if start is not None:
-        best = _match_repeatedly(odometry, scans, start_stage, start, remaining, value)
-        if best is not None:
-            value = best.value
-            # if most places are recognised another trial hardly helps
-            if best.part >= LEAST_RECOGNISED:
-                return best
-    for trust in TRUSTS:
-        nodes = scan_matched(scans, trust._replace(yaw=noise or trust.yaw), start_stage('scan matching'))
+        starts.insert(1, lambda: start)
+    for make in starts:
+        # more trust in readings does not help if nothing had a larger J than odometry
+        if make is starts[-1] and best is None:
+            break
+        nodes = make()
         if known is not None and gain_over_drive(scans, known, nodes, start_stage('judgement')).sigmas < WORTH_A_TRIAL:
             break
         found = _match_repeatedly(odometry, scans, start_stage, nodes, remaining, value)
         if found is not None:
             best, value = found, found.value
-        # nor if J of the first is no larger
-        if found is None or found.part >= LEAST_RECOGNISED:
+        # if most places are recognised another trial hardly helps
+        if best is not None and best.part >= LEAST_RECOGNISED:
             break
     return best
 

@@ -25,7 +25,7 @@ from .holding_out import (
     predicted,
     tears_apart,
 )
-from .judging import MOST_WORSE_NEARBY, SPAN
+from .judging import SPAN, is_worse_nearby
 
 OTHERS = (0, 2)
 """The first held-out window of each further fold; in the first fold it is `EVERY` // 2."""
@@ -62,7 +62,7 @@ def accepted_in_folds(drive: Drive, first: Attempt, solve: Callable[[Drive], Att
         all_visits.add(other, attempt.nodes)
         nearby.add(other, attempt.nodes)
         found.append(attempt)
-        if nearby.gain.sigmas < -MOST_WORSE_NEARBY:
+        if is_worse_nearby(nearby.gain, all_visits.gain):
             return None
         if all_visits.gain.sigmas >= LEAST_SIGMAS:
             best = max(found, key=lambda each: drive.scans.objective(each.nodes))

@@ -27,10 +27,10 @@ JUDGED_ON, HELD_OUT = 60, 40
 MOST_WORSE = 1.0
 """Standard errors by which a trajectory may predict readings worse and is still not called worse."""
 
-MOST_WORSE_NEARBY = 2.0
+MOST_WORSE_NEARBY, OUTWEIGHS = 2.0, 3.0
 """Standard errors by which a trajectory may predict readings worse within a few metres and still be accepted. With
 corridors that are wrongly taken for straight ones it is 2 to 16, even if readings are predicted much better where the
-robot came back."""
+robot came back. That outweighs it only by this many times as many standard errors."""
 
 FIRST, FEWEST_FIRST, CLEAR = 3, 12, 2.0
 """One block of this many is compared first, if these are so many; the others only if the gain of all blocks is not
@@ -74,6 +74,11 @@ def gain_within_visits(scans: Scans, before: Floats, after: Floats, watch: Progr
     visits do not agree exactly, it predicts readings better on maps of all visits even if it is wrong.
     """
     return _gain(scans, before, after, held_out_blocks(scans, len(before)), SPAN, watch)
+
+
+def is_worse_nearby(nearby: Gain, everywhere: Gain) -> bool:
+    """Return whether a trajectory is refused, by its gains on maps of the few metres around and of all visits."""
+    return nearby.sigmas < -MOST_WORSE_NEARBY and everywhere.sigmas < -OUTWEIGHS * nearby.sigmas
 
 
 def last_not_worse(scans: Scans, first: Floats, *others: Floats) -> Floats:

@@ -28,7 +28,7 @@ from .any_angle import match_drive
 from .attempt import ACCURACY, EXACT, Attempt, Drive, gain_words, refined
 from .certainty import LARGEST_SIGMA, yaw_errors
 from .holding_out import LEAST_SIGMAS, Gain, has_revisits, held_out, tears_apart
-from .judging import MOST_WORSE_NEARBY, gain_at_revisits, gain_of_objective, gain_within_visits
+from .judging import gain_at_revisits, gain_of_objective, gain_within_visits, is_worse_nearby
 from .jumps import MOST_JUMPS, jumps, without_outliers
 from .local_map import for_matching
 from .odometry_model import CALIBRATION
@@ -159,7 +159,7 @@ class Refiner:
         within = gain_within_visits(scans, windows.node, nodes, self._start_stage('judgement'))
         if not confirmed_by_places(scans, nodes, found.loops) and within.sigmas < LEAST_SIGMAS:
             return _without_better(by_walls.refinement, unconfirmed_words(found.part))
-        if within.sigmas < -MOST_WORSE_NEARBY:
+        if is_worse_nearby(within, better):
             return _without_better(by_walls.refinement, WORSE_NEARBY)
         if known is None and (walls := self._by_walls_after_all(drive, by_walls, nodes, least)) is not None:
             return walls

@@ -17,11 +17,11 @@ from .heading import NOISES, Heading, heading
 from .holding_out import LEAST_SIGMAS, Gain, has_revisits, tears_apart
 from .hypotheses import Solved, solve_hypotheses
 from .judging import (
-    MOST_WORSE_NEARBY,
     gain_at_revisits,
     gain_of_objective,
     gain_over_drive,
     gain_within_visits,
+    is_worse_nearby,
     last_not_worse,
     turns_supported,
 )
@@ -299,7 +299,7 @@ def _at_revisits(drive: Drive, walls: _AlongWalls, best: _Candidate, watch: Prog
     if revisited:
         words, proven = f'where the robot came back, {words}', better.sigmas >= LEAST_SIGMAS
         nearby = gain_within_visits(drive.scans, drive.windows.node, best.nodes, watch)
-        if nearby.sigmas < -MOST_WORSE_NEARBY:
+        if is_worse_nearby(nearby, better):
             return _Verdict(False, better, f'{words}, but not within a few metres')
         if not proven and nearby.sigmas >= LEAST_SIGMAS and better.sigmas >= LEAST_SIGMAS_WITH_WALLS:
             return _Verdict(True, nearby, f'within a few metres, {gain_words(nearby)}')

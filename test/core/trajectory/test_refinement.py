@@ -189,17 +189,19 @@ def test_walls_are_tried_again_once_matching_shows_that_odometry_is_wrong(
 
 
 @pytest.mark.parametrize(
-    ('confirmed', 'part', 'within', 'accepted'),
+    ('confirmed', 'part', 'within', 'everywhere', 'accepted'),
     [
-        (False, 1.0, 0.1, False),
-        (False, 0.5, 0.2, False),
-        (False, 0.5, 0.3, True),
-        (True, 1.0, -0.1, True),
-        (True, 1.0, -0.3, False),
+        (False, 1.0, 0.1, 1.0, False),
+        (False, 0.5, 0.2, 1.0, False),
+        (False, 0.5, 0.3, 1.0, True),
+        (True, 1.0, -0.1, 0.3, True),
+        (True, 1.0, -0.3, 0.8, False),
+        # much better where the robot came back outweighs that
+        (True, 1.0, -0.3, 1.0, True),
     ],
 )
 def test_matching_is_compared_with_odometry_within_a_few_metres(
-    bent, monkeypatch, confirmed: bool, part: float, within: float, accepted: bool
+    bent, monkeypatch, confirmed: bool, part: float, within: float, everywhere: float, accepted: bool
 ) -> None:
     """It must be better if places do not confirm it, and must not be clearly worse if they do."""
     readings, odometry = bent
@@ -212,7 +214,7 @@ def test_matching_is_compared_with_odometry_within_a_few_metres(
 
     monkeypatch.setattr(refinement, 'at_right_angles', at_right_angles)
     monkeypatch.setattr(refinement, 'match_drive', matched)
-    monkeypatch.setattr(refinement, 'gain_at_revisits', lambda *rest: Gain(1.0, 0.1))
+    monkeypatch.setattr(refinement, 'gain_at_revisits', lambda *rest: Gain(everywhere, 0.1))
     monkeypatch.setattr(refinement, 'confirmed_by_places', lambda *rest: confirmed)
     monkeypatch.setattr(refinement, 'gain_within_visits', lambda *rest: Gain(within, 0.1))
     found = Refiner(Parameters()).run(readings, odometry)
@@ -309,6 +311,7 @@ def test_walls_are_no_proof_if_recognised_places_do_not_confirm(bent, monkeypatc
             False,
             'where the robot came back, readings are predicted better than with odometry, by 0.030',
         ),
+        (6.4, -2.1, True, True, 'where the robot came back, readings are predicted better'),
         (0.0, 2.4, False, True, 'within a few metres, readings are predicted better'),
         (-1.1, 2.4, False, False, 'where the robot came back, readings are predicted worse'),
         (0.0, 0.0, False, False, 'where the robot came back, readings are predicted better'),
@@ -330,7 +333,7 @@ def test_trajectory_is_judged_on_maps_of_all_visits_and_nearby(
     found = Refiner(Parameters()).run(*bent)
     assert found.accepted == accepted
     assert found.reason.startswith(reason)
-    assert ('but not within a few metres' in found.reason) == (nearby < -2.0)
+    assert ('but not within a few metres' in found.reason) == (nearby < -2.0 and not accepted)
 
 
 @pytest.mark.parametrize(('gain', 'accepted'), [(-0.2, True), (-0.3, False)])
