@@ -19,7 +19,7 @@ import numpy as np
 
 from ..common.errors import InputError
 from ..common.readings import Floats
-from .holding_out import LEAST_SIGMAS
+from .holding_out import LEAST_SIGMAS, OTHERS, held_out
 from .judging import gain_of_objective, gain_over_drive
 from .loops import Loop
 from .odometry_model import CALIBRATION, sensitivity
@@ -60,12 +60,15 @@ class MatchedDrive(NamedTuple):
         `Scans.objective` of the nodes, nats.
     part : float
         Fraction of the blocks on an earlier visit that are recognised.
+    scans : Scans
+        With the windows that were held out.
     """
 
     nodes: Floats
     loops: list[Loop]
     value: float
     part: float
+    scans: Scans
 
 
 def match_drive(
@@ -79,7 +82,8 @@ def match_drive(
     """Return the trajectory of a drive from matching alone; None if its J is not larger than that of odometry.
 
     If the trajectory from walls is `known`, J must be larger than that of it as well, and scan matching must predict
-    readings better than it before more is tried.
+    readings better than it before more is tried. If few places are recognised, the search got lost somewhere. Small
+    changes then lead to other places, so it is repeated with other windows held out, and J decides.
 
     Parameters
     ----------
@@ -99,7 +103,7 @@ def match_drive(
         value = max(value, scans.objective(known))
     remaining = min(REMAINING_YAW_NOISE, noise or REMAINING_YAW_NOISE)
 
-    def scan_matched_with(trust: Trust) -> Floats:
+    def scan_matched_with(trust: Trust, scans: Scans = scans) -> Floats:
         return scan_matched(scans, trust._replace(yaw=noise or trust.yaw), start_stage('scan matching'))
 
     starts: list[Callable[[], Floats]] = [partial(scan_matched_with, trust) for trust in TRUSTS]
@@ -118,6 +122,14 @@ def match_drive(
         # if most places are recognised another trial hardly helps
         if best is not None and best.part >= LEAST_RECOGNISED:
             break
+    for begin in OTHERS:
+        if best is None or best.part >= LEAST_RECOGNISED or known is not None:
+            break
+        other = scans.with_held_out(held_out(len(scans.windows), begin))
+        nodes, least = scan_matched_with(TRUSTS[0], other), other.objective(other.windows.node)
+        found = _match_repeatedly(odometry, other, start_stage, nodes, remaining, least)
+        if found is not None and scans.objective(found.nodes) > value:
+            best, value = found, scans.objective(found.nodes)
     return best
 
 
@@ -147,7 +159,7 @@ def _rounds(
         solver = MatchSolver(scans.windows, scans, start_stage, relative(nodes[:-1], nodes[1:]), noise, change)
         solution, loops = solver.with_matches(solution_at(nodes, len(CALIBRATION)))
         before, nodes = nodes, solution.nodes
-        found = MatchedDrive(nodes, loops, scans.objective(nodes), recognised_part(scans, nodes, loops))
+        found = MatchedDrive(nodes, loops, scans.objective(nodes), recognised_part(scans, nodes, loops), scans)
         if found.value <= least:
             break
         best, least = found, found.value

@@ -17,6 +17,7 @@ from .attempt import Attempt, Drive, gain_words
 from .holding_out import (
     EVERY,
     LEAST_SIGMAS,
+    OTHERS,
     Gain,
     gain,
     has_revisits,
@@ -26,9 +27,6 @@ from .holding_out import (
     tears_apart,
 )
 from .judging import SPAN, is_worse_nearby
-
-OTHERS = (0, 2)
-"""The first held-out window of each further fold; in the first fold it is `EVERY` // 2."""
 
 NEARLY = 1.0
 """Standard errors by which readings must be predicted better for further folds to be tried: each takes as much time as

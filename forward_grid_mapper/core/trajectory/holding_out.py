@@ -26,6 +26,9 @@ from .scans import Scans
 EVERY = 8
 """One window of this many is held out."""
 
+OTHERS = (0, 2)
+"""The first held-out window of each further fold; in the first fold it is `EVERY` // 2."""
+
 NEAR = 4.0
 """Metres around a block within which windows make its map."""
 

@@ -21,10 +21,10 @@ from numpy.typing import NDArray
 
 from ..common.errors import InputError
 from ..common.parameters import Parameters
-from ..common.readings import Floats, Readings
+from ..common.readings import Readings
 from ..runtime.cancelling import check
 from .after_jumps import Part, begins_of, parts_at, with_doubtful
-from .any_angle import match_drive
+from .any_angle import MatchedDrive, match_drive
 from .attempt import ACCURACY, EXACT, Attempt, Drive, gain_words, refined
 from .certainty import LARGEST_SIGMA, yaw_errors
 from .holding_out import LEAST_SIGMAS, Gain, has_revisits, held_out, tears_apart
@@ -146,7 +146,7 @@ class Refiner:
             found = None
         if found is None:
             return _without_better(by_walls.refinement)
-        nodes = found.nodes
+        nodes, scans = found.nodes, found.scans
         if known is not None and gain_of_objective(scans, known, nodes).sigmas < LEAST_SIGMAS:
             return by_walls.refinement
         trajectory = refined(odometry, windows, nodes)
@@ -161,7 +161,7 @@ class Refiner:
             return _without_better(by_walls.refinement, unconfirmed_words(found.part))
         if is_worse_nearby(within, better):
             return _without_better(by_walls.refinement, WORSE_NEARBY)
-        if known is None and (walls := self._by_walls_after_all(drive, by_walls, nodes, least)) is not None:
+        if known is None and (walls := self._by_walls_after_all(drive, by_walls, found, least)) is not None:
             return walls
         at_revisits = 'where the robot came back, ' if has_revisits(scans, nodes) else ''
         by_name = dict.fromkeys(CALIBRATION, 0.0) | {
@@ -183,14 +183,13 @@ class Refiner:
         )
 
     def _by_walls_after_all(
-        self, drive: Drive, refused: Attempt, nodes: Floats, least: Differences
+        self, drive: Drive, refused: Attempt, matched: MatchedDrive, least: Differences
     ) -> Refinement | None:
         """Return the trajectory with walls at right angles, unless matching alone is better; then None.
 
-        `nodes`, shape (K, 3), are those of matching alone, which have shown that odometry is wrong; `refused` is the
-        attempt with walls, which has not.
+        Matching has shown that odometry is wrong; `refused` is the attempt with walls, which has not.
         """
-        by_walls = refused.unproven
+        by_walls, nodes = refused.unproven, matched.nodes
         if refused.before_matching:
             noise = self._parameters.association.odometry_noise
             by_walls = at_right_angles(drive, noise, least, self._start_stage, odometry_is_wrong=True)
@@ -198,7 +197,9 @@ class Refiner:
             return None
         if tears_apart(drive.scans, nodes, by_walls.nodes):
             return None
-        for compared in (gain_at_revisits, gain_of_objective):
+        # neither must have been fitted to the windows that are predicted
+        by_held_out = (gain_at_revisits,) if matched.scans is drive.scans else ()
+        for compared in (*by_held_out, gain_of_objective):
             try:
                 if compared(drive.scans, by_walls.nodes, nodes).sigmas >= LEAST_SIGMAS:
                     return None

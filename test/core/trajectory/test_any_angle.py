@@ -12,11 +12,11 @@ from forward_grid_mapper.core.common.errors import InputError
 from forward_grid_mapper.core.common.readings import Floats
 from forward_grid_mapper.core.trajectory import any_angle, scan_matching
 from forward_grid_mapper.core.trajectory import scans as scans_module
-from forward_grid_mapper.core.trajectory.holding_out import Gain
+from forward_grid_mapper.core.trajectory.holding_out import Gain, held_out
 from forward_grid_mapper.core.trajectory.odometry_model import CALIBRATION
 from forward_grid_mapper.core.trajectory.pose_graph import Solution, solution_at
 from forward_grid_mapper.core.trajectory.poses import relative
-from forward_grid_mapper.core.trajectory.scan_matching import TRUSTS
+from forward_grid_mapper.core.trajectory.scan_matching import TRUSTS, Trust
 from forward_grid_mapper.core.trajectory.scans import Scans
 from forward_grid_mapper.simulation.drift import odometry_of
 
@@ -30,9 +30,14 @@ class Trials:
         The share of recognised places of each round, and its J.
     far : float
         Metres by which a round moves the nodes.
+    others : tuple of int
+        Further folds that are tried.
     """
 
-    def __init__(self, monkeypatch, values: list[tuple[float, float]], far: float = 1.0) -> None:
+    def __init__(
+        self, monkeypatch, values: list[tuple[float, float]], far: float = 1.0, others: tuple[int, ...] = ()
+    ) -> None:
+        monkeypatch.setattr(any_angle, 'OTHERS', others)
         self.calls: list[tuple[Floats, float]] = []
         self._far = far
         monkeypatch.setattr(any_angle, 'MatchSolver', self._solver)
@@ -150,6 +155,40 @@ def test_given_nodes_are_another_start(
     assert (found and found.value) == value
     assert seen == pytest.approx(begins)
     assert len(trials.calls) == len(values)
+
+
+@pytest.mark.parametrize(
+    ('values', 'folds', 'value', 'fold'),
+    [
+        # the last of the first fold, then one or two others
+        ([(0.5, 2.0), (0.5, 1.0), (0.9, 1.0), (0.9, 3.0)], 1, 3.0, 0),
+        ([(0.5, 2.0), (0.5, 1.0), (0.9, 1.0), (0.9, 1.5), (0.9, 3.0)], 2, 3.0, 2),
+        ([(0.5, 2.0), (0.5, 1.0), (0.9, 1.0), (0.9, 1.5), (0.9, 1.9)], 2, 2.0, None),
+        ([(0.9, 2.0)], 0, 2.0, None),
+        ([(0.9, -1.0)], 0, None, None),
+    ],
+)
+def test_search_that_got_lost_is_repeated_with_other_windows_held_out(
+    bent, scans, monkeypatch, values: list[tuple[float, float]], folds: int, value: float | None, fold: int | None
+) -> None:
+    trials, held = Trials(monkeypatch, values, others=(0, 2)), list[Scans]()
+
+    def scan_matched(s: Scans, trust: Trust, watch) -> Floats:
+        held.append(s)
+        return s.windows.node
+
+    monkeypatch.setattr(any_angle, 'scan_matched', scan_matched)
+    found = any_angle.match_drive(bent[1], scans, lambda stage: quietly)
+    assert len(trials.calls) == len(values)
+    assert (found and found.value) == value
+    others = [each for each in held if each is not scans]
+    assert len(others) == folds
+    if found is not None:
+        # it must be judged by the windows that were held out when it was made
+        assert found.scans is (scans if fold is None else others[(0, 2).index(fold)])
+        np.testing.assert_array_equal(
+            found.scans.held_out, held_out(len(scans.windows), *([] if fold is None else [fold]))
+        )
 
 
 @pytest.mark.parametrize('factor', [0.9, 1.1])

@@ -173,7 +173,7 @@ def test_walls_are_tried_again_once_matching_shows_that_odometry_is_wrong(
         return Attempt(outcome, drive.windows.node, before_matching=not odometry_is_wrong)
 
     def matched(odometry: Odometry, scans: Scans, *rest) -> MatchedDrive:
-        return MatchedDrive(scans.windows.node * (1.1, 1.0, 1.0), [], 0.0, 1.0)
+        return MatchedDrive(scans.windows.node * (1.1, 1.0, 1.0), [], 0.0, 1.0, scans)
 
     monkeypatch.setattr(refinement, 'at_right_angles', at_right_angles)
     monkeypatch.setattr(refinement, 'match_drive', matched)
@@ -210,7 +210,7 @@ def test_matching_is_compared_with_odometry_within_a_few_metres(
         return Attempt(Refinement(False, 'no walls', readings, odometry, {}), drive.windows.node)
 
     def matched(odometry: Odometry, scans: Scans, *rest) -> MatchedDrive:
-        return MatchedDrive(scans.windows.node * (1.1, 1.0, 1.0), [], 0.0, part)
+        return MatchedDrive(scans.windows.node * (1.1, 1.0, 1.0), [], 0.0, part, scans)
 
     monkeypatch.setattr(refinement, 'at_right_angles', at_right_angles)
     monkeypatch.setattr(refinement, 'match_drive', matched)
@@ -235,7 +235,7 @@ def test_walls_that_tear_apart_what_matching_brings_together_are_not_taken(bent,
         return Attempt(outcome, drive.windows.node * (50.0, 1.0, 1.0), before_matching=True)
 
     def matched(odometry: Odometry, scans: Scans, *rest) -> MatchedDrive:
-        return MatchedDrive(scans.windows.node * (1.1, 1.0, 1.0), [], 0.0, 1.0)
+        return MatchedDrive(scans.windows.node * (1.1, 1.0, 1.0), [], 0.0, 1.0, scans)
 
     monkeypatch.setattr(refinement, 'at_right_angles', at_right_angles)
     monkeypatch.setattr(refinement, 'match_drive', matched)

@@ -139,7 +139,9 @@ def no_walls(windows, scans, odometry_noise, watch) -> tuple[None, float]:
 def test_trajectory_not_supported_by_readings_is_rejected(bent, matched, monkeypatch) -> None:
     recording, odometry = bent
     monkeypatch.setattr(right_angles, 'heading_of_walls', no_walls)
-    monkeypatch.setattr(refinement, 'match_drive', lambda *rest: MatchedDrive(matched, [], np.inf, 1.0))
+    monkeypatch.setattr(
+        refinement, 'match_drive', lambda odometry, scans, *rest: MatchedDrive(matched, [], np.inf, 1.0, scans)
+    )
     monkeypatch.setattr(refinement, 'gain_at_revisits', lambda *rest: Gain(0.02, 0.01))
     left = Refiner(Parameters()).run(recording.readings, odometry)
     assert not left.accepted and left.trajectory is odometry
@@ -149,7 +151,9 @@ def test_trajectory_not_supported_by_readings_is_rejected(bent, matched, monkeyp
 def test_matching_alone_is_not_tried_with_sparse_poses(bent, matched, monkeypatch) -> None:
     recording, odometry = bent
     monkeypatch.setattr(right_angles, 'heading_of_walls', no_walls)
-    monkeypatch.setattr(refinement, 'match_drive', lambda *rest: MatchedDrive(matched, [], np.inf, 1.0))
+    monkeypatch.setattr(
+        refinement, 'match_drive', lambda odometry, scans, *rest: MatchedDrive(matched, [], np.inf, 1.0, scans)
+    )
     monkeypatch.setattr(refinement, 'gain_at_revisits', lambda *rest: Gain(0.1, 0.01))
     assert Refiner(Parameters()).run(recording.readings, odometry).accepted
     # one pose a metre, as in a recording at 0.5 Hz
@@ -168,7 +172,7 @@ def test_matching_alone_that_hardly_moves_odometry_is_not_called_no_better(bent,
     def hardly_moved(odometry: Odometry, scans: Scans, *rest: object) -> MatchedDrive:
         nodes = scans.windows.node.copy()
         nodes[::2, 0] += 0.1
-        return MatchedDrive(nodes, [], np.inf, 1.0)
+        return MatchedDrive(nodes, [], np.inf, 1.0, scans)
 
     monkeypatch.setattr(refinement, 'match_drive', hardly_moved)
     left = Refiner(Parameters()).run(recording.readings, odometry)
@@ -186,11 +190,12 @@ def test_trajectory_that_mainly_turns_odometry_is_judged_by_readings(bent, monke
     def turned(odometry: Odometry, scans: Scans, *rest: object) -> MatchedDrive:
         nodes = scans.windows.node.copy()
         nodes[len(nodes) // 2 :, 2] += angle
-        return MatchedDrive(nodes, [], np.inf, 1.0)
+        return MatchedDrive(nodes, [], np.inf, 1.0, scans)
 
     monkeypatch.setattr(refinement, 'match_drive', turned)
     monkeypatch.setattr(refinement, 'gain_at_revisits', lambda *rest: Gain(0.1, 0.01))
     monkeypatch.setattr(refinement, 'confirmed_by_places', lambda *rest: True)
+    monkeypatch.setattr(refinement, 'gain_within_visits', lambda *rest: Gain(0.0, 0.01))
     taken = Refiner(Parameters()).run(recording.readings, odometry)
     assert taken.accepted and taken.moved < 0.15
     assert taken.turned == pytest.approx(angle / 2, rel=0.1)
@@ -235,7 +240,7 @@ def test_reason_says_that_the_robot_came_back_only_if_it_did(bent, scans, matche
     recording, odometry = bent
     monkeypatch.setattr(refinement, 'gain_at_revisits', lambda *rest: Gain(0.1, 0.01))
     monkeypatch.setattr(refinement, 'gain_of_objective', lambda *rest: Gain(0.1, 0.01))
-    told = MatchedDrive(matched, [], np.inf, 0.0)
+    told = MatchedDrive(matched, [], np.inf, 0.0, scans)
     monkeypatch.setattr(refinement, 'match_drive', lambda *rest: told)
     monkeypatch.setattr(refinement, 'has_revisits', lambda *rest: again)
     drive_of = Drive(recording.readings, odometry, scans.windows, scans)
@@ -265,7 +270,7 @@ def test_matches_alone_replace_walls_only_with_a_much_larger_j(
     attempt, told = by_walls(scans, recording, odometry), []
     monkeypatch.setattr(refinement, 'gain_at_revisits', lambda *rest: Gain(0.1, 0.01))
     monkeypatch.setattr(refinement, 'gain_of_objective', lambda *rest: told.append(rest[1:]) or Gain(sigmas, 1.0))
-    monkeypatch.setattr(refinement, 'match_drive', lambda *rest: MatchedDrive(matched, [], np.inf, 1.0))
+    monkeypatch.setattr(refinement, 'match_drive', lambda *rest: MatchedDrive(matched, [], np.inf, 1.0, scans))
     found = Refiner(Parameters())._at_any_angle(
         Drive(recording.readings, odometry, scans.windows, scans), attempt, ACCURACY
     )
