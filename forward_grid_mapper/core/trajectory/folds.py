@@ -15,7 +15,6 @@ import numpy as np
 from ..common.readings import Floats
 from .attempt import Attempt, Drive, gain_words
 from .holding_out import (
-    EVERY,
     LEAST_SIGMAS,
     OTHERS,
     Gain,
@@ -88,5 +87,5 @@ class _Compared:
 
 
 def _with_gain(attempt: Attempt, better: Gain, folds: int) -> Attempt:
-    reason = f'with {folds} of {EVERY} windows held out in turn, {gain_words(better)}'
+    reason = f'with other windows held out in each of {folds} trials, {gain_words(better)}'
     return attempt._replace(refinement=replace(attempt.refinement, reason=reason, gain=better.mean), by_votes=False)

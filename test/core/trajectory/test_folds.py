@@ -92,9 +92,8 @@ def test_folds_are_added_while_they_may_show_that_odometry_is_wrong(
     if found is not None:
         # that of the largest J, which is no longer accepted by votes
         assert found.nodes[0, 0] == trial.attempt(1 + solved).nodes[0, 0] and not found.by_votes
-        assert f'with {1 + solved} of {EVERY} windows held out in turn, readings are predicted better' in (
-            found.refinement.reason
-        )
+        reason = f'with other windows held out in each of {1 + solved} trials, readings are predicted better'
+        assert found.refinement.reason.startswith(reason)
         assert found.refinement.gain > 0.0
 
 
