@@ -162,9 +162,12 @@ def at_right_angles(
         return _heading_lost(drive, found.certainty)._replace(start=found.solution.nodes)
     watch = start_stage('judgement')
     best, verdict = _judged(drive, walls, found, watch)
-    if not verdict.accepted and (further := _matched_further(drive.scans, found)) is not found:
-        best, verdict = _judged(drive, walls, further, watch)
     attempt = _accepted(drive, best, verdict, walls.heading.drifts.noise, least)
+    # a trajectory that hardly differs from odometry would be refused anyway
+    unproven = attempt.refinement.accepted and not verdict.accepted
+    if unproven and (further := _matched_further(drive.scans, found)) is not found:
+        best, verdict = _judged(drive, walls, further, watch)
+        attempt = _accepted(drive, best, verdict, walls.heading.drifts.noise, least)
     if verdict.accepted or odometry_is_wrong:
         return attempt
     if not attempt.refinement.accepted:
