@@ -19,6 +19,7 @@ from forward_grid_mapper.core.trajectory.any_angle import MatchedDrive
 from forward_grid_mapper.core.trajectory.attempt import Attempt, Drive, gain_words
 from forward_grid_mapper.core.trajectory.heading import NOISES, Drifts, Heading
 from forward_grid_mapper.core.trajectory.holding_out import (
+    EVERY,
     FEWEST_BLOCKS,
     NEAR,
     REVISIT_AFTER,
@@ -350,6 +351,59 @@ def test_votes_do_not_suffice_if_readings_as_a_whole_contradict_them(
     for module in (right_angles, refinement):
         monkeypatch.setattr(module, 'gain_of_objective', lambda *rest: Gain(gain, 0.1))
     assert Refiner(Parameters()).run(*bent).accepted == accepted
+
+
+@pytest.mark.parametrize(
+    ('refused', 'torn', 'given'), [('unproven', False, True), ('unproven', True, False), ('lost', False, True)]
+)
+def test_matching_may_start_from_a_refused_trajectory_that_comes_back(
+    bent, monkeypatch, solved_once, refused: str, torn: bool, given: bool
+) -> None:
+    starts: list[Floats | None] = []
+    monkeypatch.setattr(refinement, 'match_drive', lambda *rest: starts.append(rest[5]))
+    let_come_back(monkeypatch, lambda scans, nodes: not torn or nodes is scans.windows.node)
+    monkeypatch.setattr(right_angles, 'gain_over_drive', lambda *rest: Gain(0.001, 0.01))
+    monkeypatch.setattr(right_angles, 'gain_at_revisits', lambda *rest: Gain(0.0, 0.01))
+    monkeypatch.setattr(right_angles, 'gain_within_visits', lambda *rest: Gain(0.0, 0.01))
+    monkeypatch.setattr(right_angles, '_is_recognised', lambda *rest: False)
+    monkeypatch.setattr(right_angles, 'accepted_in_folds', lambda *rest: None)
+    if refused == 'lost':
+        solve = right_angles.solve_hypotheses
+        monkeypatch.setattr(right_angles, 'solve_hypotheses', lambda *rest: replace(solve(*rest), certainty=0.5))
+    assert not Refiner(Parameters()).run(*bent).accepted
+    assert len(starts) == 1 and (starts[0] is not None) == given
+
+
+@pytest.mark.parametrize('own_fold', [False, True])
+def test_matched_trajectory_is_judged_by_the_windows_that_were_held_out(bent, monkeypatch, own_fold: bool) -> None:
+    (readings, odometry), judged_by, after_all = bent, list[Scans](), list[Scans]()
+
+    def at_right_angles(drive: Drive, *rest) -> Attempt:
+        outcome = Refinement(True, 'walls', readings, odometry, {})
+        walls = Attempt(outcome, drive.windows.node * (1.2, 1.0, 1.0))
+        return Attempt(replace(outcome, accepted=False), drive.windows.node, unproven=walls)
+
+    def matched(odometry: Odometry, scans: Scans, *rest) -> MatchedDrive:
+        mine = scans if own_fold else scans.with_held_out(held_out(len(scans.windows), 0))
+        return MatchedDrive(scans.windows.node * (1.1, 1.0, 1.0), [], 0.0, 1.0, mine)
+
+    def gain_at_revisits(scans: Scans, before: Floats, after: Floats, *rest) -> Gain:
+        (judged_by if before is scans.windows.node else after_all).append(scans)
+        return Gain(1.0, 0.1)
+
+    monkeypatch.setattr(refinement, 'at_right_angles', at_right_angles)
+    monkeypatch.setattr(refinement, 'match_drive', matched)
+    let_come_back(monkeypatch, lambda *rest: True)
+    monkeypatch.setattr(refinement, 'confirmed_by_places', lambda *rest: True)
+    monkeypatch.setattr(refinement, 'gain_within_visits', lambda *rest: Gain(0.0, 0.1))
+    monkeypatch.setattr(refinement, 'gain_of_objective', lambda *rest: Gain(0.0, 0.1))
+    monkeypatch.setattr(refinement, 'gain_at_revisits', gain_at_revisits)
+    found = Refiner(Parameters()).run(readings, odometry)
+    begin = EVERY // 2 if own_fold else 0
+    assert [int(np.flatnonzero(scans.held_out)[0]) for scans in judged_by] == [begin]
+    # the trajectory with walls was fitted to the windows that another fold held out
+    assert len(after_all) == own_fold
+    assert found.reason.startswith('walls are not assumed' if own_fold else 'walls; scan matching alone shows')
 
 
 def test_drive_is_matched_further_while_its_objective_grows(bent, monkeypatch, solved_once) -> None:
