@@ -273,6 +273,33 @@ def test_doubtful_walls_need_a_larger_objective(bent, monkeypatch, by_votes: boo
         assert 'what walls say is doubtful' in found.reason and '(0.2 ± 0.1 nats for each 1.6 m)' in found.reason
 
 
+@pytest.mark.parametrize('proven', [True, False])
+def test_doubtful_walls_may_be_proven_by_other_windows(bent, monkeypatch, proven: bool) -> None:
+    readings, odometry = bent
+
+    def at_right_angles(drive: Drive, *rest) -> Attempt:
+        return Attempt(Refinement(True, 'walls', readings, odometry, {}), drive.windows.node, by_votes=True)
+
+    def proven_in_folds(drive: Drive, attempt: Attempt, *rest) -> Attempt | None:
+        return attempt._replace(refinement=replace(attempt.refinement, reason='trials')) if proven else None
+
+    monkeypatch.setattr(refinement, 'at_right_angles', at_right_angles)
+    monkeypatch.setattr(refinement, 'match_drive', no_matches)
+    monkeypatch.setattr(refinement, 'gain_of_objective', lambda *rest: Gain(0.1, 0.1))
+    monkeypatch.setattr(refinement, 'proven_in_folds', proven_in_folds)
+    found = Refiner(Parameters()).run(readings, odometry)
+    assert found.accepted == proven
+    assert found.reason.startswith('trials' if proven else 'what walls say is doubtful')
+
+
+@pytest.mark.parametrize(('blocks', 'confirmed', 'recognised'), [(3, True, True), (2, True, False), (3, False, False)])
+def test_votes_need_some_recognised_places(monkeypatch, blocks: int, confirmed: bool, recognised: bool) -> None:
+    monkeypatch.setattr(right_angles, 'recognised', lambda loops: set(range(len(loops))))
+    monkeypatch.setattr(right_angles, 'confirmed_by_places', lambda *rest: confirmed)
+    best = right_angles._Candidate(np.zeros((1, 3)), {}, [None] * blocks)  # type: ignore[list-item]
+    assert right_angles._is_recognised(None, best) == recognised  # type: ignore[arg-type]
+
+
 def test_walls_are_no_proof_if_recognised_places_do_not_confirm(bent, monkeypatch, solved_once) -> None:
     # walls that are not parallel give a wrong yaw, and readings are predicted about as well
     monkeypatch.setattr(refinement, 'match_drive', no_matches)
