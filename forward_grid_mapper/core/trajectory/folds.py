@@ -7,11 +7,13 @@ are then compared together.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
 
+from ..common.errors import InputError
 from ..common.readings import Floats
 from .attempt import Attempt, Drive, gain_words
 from .holding_out import (
@@ -26,6 +28,7 @@ from .holding_out import (
     tears_apart,
 )
 from .judging import SPAN, is_worse_nearby
+from .scans import Scans
 
 NEARLY = 1.0
 """Standard errors by which readings must be predicted better for further folds to be tried: each takes as much time as
@@ -62,9 +65,17 @@ def accepted_in_folds(drive: Drive, first: Attempt, solve: Callable[[Drive], Att
         if is_worse_nearby(nearby.gain, all_visits.gain):
             return None
         if all_visits.gain.sigmas >= LEAST_SIGMAS:
-            best = max(found, key=lambda each: drive.scans.objective(each.nodes))
+            best = max(found, key=lambda each: _objective(drive.scans, each.nodes))
             return _with_gain(best, all_visits.gain, len(found))
     return None
+
+
+def _objective(scans: Scans, nodes: Floats) -> float:
+    """Return J of the map of the whole drive, nats; -inf if the map is too large at the cell size of matching."""
+    try:
+        return scans.objective(nodes)
+    except InputError:
+        return -math.inf
 
 
 class _Compared:

@@ -230,16 +230,20 @@ def _along_walls(
 
 def _matched_further(scans: Scans, found: Solved) -> Solved:
     """Return the drive matched again from its solution, as long as J grows and nodes move."""
-    value = scans.objective(found.solution.nodes)
-    for _ in range(ROUNDS):
-        solution, loops = found.solver.with_matches(found.solution)
-        now = scans.objective(solution.nodes)
-        if now <= value:
-            return found
-        moved = rms_after_alignment(found.solution.nodes, solution.nodes)
-        found, value = replace(found, solution=solution, loops=loops), now
-        if moved < SETTLED:
-            return found
+    try:
+        value = scans.objective(found.solution.nodes)
+        for _ in range(ROUNDS):
+            solution, loops = found.solver.with_matches(found.solution)
+            now = scans.objective(solution.nodes)
+            if now <= value:
+                break
+            moved = rms_after_alignment(found.solution.nodes, solution.nodes)
+            found, value = replace(found, solution=solution, loops=loops), now
+            if moved < SETTLED:
+                break
+    except InputError:
+        # at the cell size of matching, the map of the whole drive may be too large although the final maps are not
+        pass
     return found
 
 

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from forward_grid_mapper.core.common.errors import InputError
 from forward_grid_mapper.core.common.readings import Floats
 from forward_grid_mapper.core.trajectory import folds, holding_out
 from forward_grid_mapper.core.trajectory.attempt import Attempt, Drive
@@ -95,6 +96,17 @@ def test_folds_are_added_while_they_may_show_that_odometry_is_wrong(
         reason = f'with other windows held out in each of {1 + solved} trials, readings are predicted better'
         assert found.refinement.reason.startswith(reason)
         assert found.refinement.gain > 0.0
+
+
+def test_first_fold_is_taken_if_the_map_of_the_whole_drive_is_too_large(scans, monkeypatch) -> None:
+    trial = Folds(monkeypatch, scans, [ENOUGH, ENOUGH])
+
+    def too_large(*rest) -> float:
+        raise InputError
+
+    monkeypatch.setattr(Scans, 'objective', too_large)
+    found = trial.judged()
+    assert found is not None and found.nodes[0, 0] == trial.attempt(1).nodes[0, 0]
 
 
 def test_each_fold_holds_out_other_windows(scans, monkeypatch) -> None:

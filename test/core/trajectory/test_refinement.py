@@ -10,7 +10,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from forward_grid_mapper.core.common.errors import Cancelled
+from forward_grid_mapper.core.common.errors import Cancelled, InputError
 from forward_grid_mapper.core.common.parameters import Parameters
 from forward_grid_mapper.core.common.readings import Floats, Readings
 from forward_grid_mapper.core.mapping import Mapper
@@ -431,6 +431,21 @@ def test_matched_trajectory_is_judged_by_the_windows_that_were_held_out(bent, mo
     # the trajectory with walls was fitted to the windows that another fold held out
     assert len(after_all) == own_fold
     assert found.reason.startswith('walls are not assumed' if own_fold else 'walls; scan matching alone shows')
+
+
+def test_drive_whose_map_would_be_too_large_is_not_matched_further(bent, monkeypatch, solved_once) -> None:
+    def too_large(*rest) -> float:
+        raise InputError
+
+    monkeypatch.setattr(refinement, 'match_drive', no_matches)
+    let_come_back(monkeypatch, lambda *rest: True)
+    monkeypatch.setattr(right_angles, 'gain_over_drive', lambda *rest: Gain(0.001, 0.01))
+    monkeypatch.setattr(right_angles, 'gain_at_revisits', lambda *rest: Gain(0.0, 0.01))
+    monkeypatch.setattr(right_angles, 'gain_within_visits', lambda *rest: Gain(0.0, 0.01))
+    monkeypatch.setattr(right_angles, '_is_recognised', lambda *rest: False)
+    monkeypatch.setattr(right_angles, 'accepted_in_folds', lambda *rest: None)
+    monkeypatch.setattr(Scans, 'objective', too_large)
+    assert not Refiner(Parameters()).run(*bent).accepted
 
 
 def test_drive_is_matched_further_while_its_objective_grows(bent, monkeypatch, solved_once) -> None:
