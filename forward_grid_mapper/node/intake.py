@@ -282,7 +282,7 @@ class Intake:
         elif len(self._pending) - self._pending_ranges < MOST_WAITING:
             self._hold(made, sent)
         else:
-            self._odometry_losses.add(1)
+            self._odometry_losses.dropped()
         self._wake()
 
     def begin(self) -> None:

@@ -45,10 +45,11 @@ class _Stream(NamedTuple):
 class Losses:
     """Counts the messages lost on one topic.
 
+    A loss that the middleware reports may be seen as a gap too, before or after the report, so the larger of both
+    counts is taken.
+
     Attributes
     ----------
-    lost : int
-        Number of messages so far.
     recent : float
         Time of the last loss, by `time.monotonic`.
     """
@@ -66,26 +67,35 @@ class Losses:
 
     def clear(self) -> None:
         """Set the counts to 0."""
-        self._reported = self.lost = 0
+        self._reported = self._in_gaps = self._dropped = 0
         self.recent = -LOSS_WARNING
+
+    @property
+    def lost(self) -> int:
+        """Number of lost messages so far."""
+        return self._dropped + max(self._reported, self._in_gaps)
 
     def taken(self, info: dict[str, Any], frame: str, stamp: int) -> None:
         """Note a message: rclpy's info, frame_id, and stamp in nanoseconds."""
         number = info.get('publication_sequence_number')
         missing = self._by_stamp(frame, stamp) if number is None else self._by_number(number)
-        if missing:
-            self.add(missing)
+        self._add(in_gaps=missing)
 
     def reported(self, info: Any) -> None:
-        """Note losses that the middleware reports; they may be the same messages as those of gaps."""
-        self._reported += info.total_count_change
-        if self._reported > self.lost:
-            self.add(self._reported - self.lost)
+        """Note losses that the middleware reports."""
+        self._add(reported=info.total_count_change)
 
-    def add(self, missing: int) -> None:
-        """Add lost messages."""
-        self.lost += missing
-        self.recent = time.monotonic()
+    def dropped(self) -> None:
+        """Note a message that arrived, and that the node could not keep."""
+        self._add(dropped=1)
+
+    def _add(self, in_gaps: int = 0, reported: int = 0, dropped: int = 0) -> None:
+        before = self.lost
+        self._in_gaps += in_gaps
+        self._reported += reported
+        self._dropped += dropped
+        if self.lost > before:
+            self.recent = time.monotonic()
 
     def _by_number(self, number: int) -> int:
         """Return the number of messages missing before this one, for the publisher with the nearest number."""

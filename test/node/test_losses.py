@@ -77,7 +77,17 @@ def test_sensor_without_a_regular_rate_has_no_losses() -> None:
     assert losses.lost == 0
 
 
-def test_losses_from_middleware_and_gaps_are_counted_once() -> None:
+def test_losses_reported_before_their_gap_are_counted_once() -> None:
+    losses = Losses(lambda: 1)
+    numbered(losses, 1, 2)
+    losses.reported(LostMessages(5))
+    numbered(losses, 8)
+    assert losses.lost == 5
+    losses.dropped()
+    assert losses.lost == 6, 'what the node drops has arrived, so it is in neither of the other counts'
+
+
+def test_losses_reported_after_their_gap_are_counted_once() -> None:
     losses = Losses(lambda: 1)
     numbered(losses, 1, 2, 8)
     losses.reported(LostMessages(5))
