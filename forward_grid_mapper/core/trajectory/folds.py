@@ -46,14 +46,13 @@ def accepted_in_folds(drive: Drive, first: Attempt, solve: Callable[[Drive], Att
     solve : callable
         Returns the attempt at a drive with other windows held out.
     """
-    if tears_apart(drive.scans, drive.windows.node, first.nodes):
-        return None
+    torn = tears_apart(drive.scans, drive.windows.node, first.nodes)
     revisited = has_revisits(drive.scans, first.nodes)
     found, all_visits, nearby = [first], _Compared(np.inf), _Compared(SPAN)
     all_visits.add(drive, first.nodes)
     nearby.add(drive, first.nodes)
     for begin in OTHERS:
-        if all_visits.gain.sigmas < NEARLY:
+        if _decisive(all_visits, nearby, torn).sigmas < NEARLY:
             return None
         other = drive.with_held_out(held_out(len(drive.windows), begin))
         attempt = solve(other)
@@ -64,10 +63,18 @@ def accepted_in_folds(drive: Drive, first: Attempt, solve: Callable[[Drive], Att
         found.append(attempt)
         if is_worse_nearby(nearby.gain, all_visits.gain):
             return None
-        if all_visits.gain.sigmas >= LEAST_SIGMAS:
+        better = _decisive(all_visits, nearby, torn)
+        if better.sigmas >= LEAST_SIGMAS:
             best = max(found, key=lambda each: _objective(drive.scans, each.nodes))
-            return _with_gain(best, all_visits.gain, len(found))
+            return _with_gain(best, better, len(found))
     return None
+
+
+def _decisive(all_visits: _Compared, nearby: _Compared, torn: bool) -> Gain:
+    """Return the gain that decides: on maps of all visits; of a trajectory that `tears_apart`, the less clear one."""
+    if not torn:
+        return all_visits.gain
+    return min(all_visits.gain, nearby.gain, key=lambda each: each.sigmas)
 
 
 def _objective(scans: Scans, nodes: Floats) -> float:

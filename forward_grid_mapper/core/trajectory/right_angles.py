@@ -296,26 +296,40 @@ def _at_revisits(drive: Drive, walls: _AlongWalls, best: _Candidate, watch: Prog
     Revisits show drift over the whole drive, and walls that are not parallel. Whether the robot came back is decided
     along the refined nodes, since by odometry it may be wrong. But votes do not suffice if the robot comes back to
     places by odometry and to none along the refined nodes: the walls of a corridor around a hall can be taken for
-    straight ones. If it comes back along the refined nodes, votes suffice if the places are recognised.
+    straight ones. Then readings must be predicted better within a few metres. If it comes back along the refined
+    nodes, votes suffice if the places are recognised.
     """
     revisited = has_revisits(drive.scans, best.nodes)
-    if not revisited and (not walls.votes_suffice or tears_apart(drive.scans, drive.windows.node, best.nodes)):
+    if not revisited and not walls.votes_suffice:
         return walls.verdict
     better = gain_at_revisits(drive.scans, drive.windows.node, best.nodes, watch)
+    if tears_apart(drive.scans, drive.windows.node, best.nodes):
+        nearby = gain_within_visits(drive.scans, drive.windows.node, best.nodes, watch)
+        return _nearby(nearby) if _is_proven_nearby(nearby, better) else walls.verdict
     words = gain_words(better)
     if revisited:
         words, proven = f'where the robot came back, {words}', better.sigmas >= LEAST_SIGMAS
         nearby = gain_within_visits(drive.scans, drive.windows.node, best.nodes, watch)
         if is_worse_nearby(nearby, better):
             return _Verdict(False, better, f'{words}, but not within a few metres')
-        if not proven and nearby.sigmas >= LEAST_SIGMAS and better.sigmas >= LEAST_SIGMAS_WITH_WALLS:
-            return _Verdict(True, nearby, f'within a few metres, {gain_words(nearby)}')
+        if not proven and _is_proven_nearby(nearby, better):
+            return _nearby(nearby)
         if proven or not (walls.votes_suffice and _is_recognised(drive.scans, best)):
             return _Verdict(proven, better, words)
     if better.sigmas < LEAST_SIGMAS_WITH_WALLS:
         return _Verdict(False, better, words)
     likelier = f'the readings are more likely by {walls.vote_gain:.0f} nats than with odometry'
     return _Verdict(True, better, f'with walls at right angles, {likelier}; {words}', by_votes=True)
+
+
+def _is_proven_nearby(nearby: Gain, everywhere: Gain) -> bool:
+    """Return whether gains on maps of the few metres around and of all visits show that odometry is wrong."""
+    return nearby.sigmas >= LEAST_SIGMAS and everywhere.sigmas >= LEAST_SIGMAS_WITH_WALLS
+
+
+def _nearby(nearby: Gain) -> _Verdict:
+    """Return the judgement by readings within a few metres that show that odometry is wrong."""
+    return _Verdict(True, nearby, f'within a few metres, {gain_words(nearby)}')
 
 
 def _is_recognised(scans: Scans, best: _Candidate) -> bool:

@@ -128,9 +128,27 @@ def test_readings_of_other_held_out_windows_are_not_used(scans) -> None:
     assert not other.predictions and other.predictions is not scans.predictions
 
 
-@pytest.mark.parametrize('back', [[True, False, False], [True, True, False]])
-def test_trajectories_that_come_back_to_other_places_are_no_proof(scans, monkeypatch, back: list[bool]) -> None:
-    assert Folds(monkeypatch, scans, [ENOUGH, ENOUGH], back).judged() is None
+def test_trajectories_that_come_back_to_other_places_are_no_proof(scans, monkeypatch) -> None:
+    assert Folds(monkeypatch, scans, [ENOUGH, ENOUGH], [True, True, False]).judged() is None
+
+
+@pytest.mark.parametrize(
+    ('everywhere', 'nearby', 'solved', 'accepted'),
+    [
+        (ENOUGH, ENOUGH, 1, True),
+        (100.0, ENOUGH, 1, True),
+        # on maps of all visits, only odometry can contradict itself
+        (100.0, NEARLY - 0.1, 0, False),
+        (NEARLY - 0.1, 100.0, 0, False),
+        (100.0, 1.2, 2, False),
+    ],
+)
+def test_trajectory_that_tears_apart_must_be_better_nearby_as_well(
+    scans, monkeypatch, everywhere: float, nearby: float, solved: int, accepted: bool
+) -> None:
+    trial = Folds(monkeypatch, scans, [everywhere] * 3, [True, False, False, False], nearby)
+    assert (trial.judged() is not None) == accepted
+    assert len(trial.held_out) == solved
 
 
 @pytest.mark.parametrize(('nearby', 'accepted'), [(-1.3, True), (-1.5, False)])

@@ -321,10 +321,25 @@ def test_walls_are_no_proof_if_recognised_places_do_not_confirm(bent, monkeypatc
     worse = Refiner(Parameters()).run(*bent)
     assert not worse.accepted
     assert worse.reason.startswith('readings are predicted worse than')
-    # nor are they if the robot came back by odometry, but would not along walls
-    monkeypatch.setattr(right_angles, 'gain_at_revisits', lambda *rest: Gain(1.0, 0.01))
+
+
+@pytest.mark.parametrize(
+    ('everywhere', 'nearby', 'accepted'),
+    [(100.0, 2.2, False), (100.0, 2.4, True), (-0.9, 2.4, True), (-1.1, 2.4, False)],
+)
+def test_trajectory_that_tears_apart_must_predict_readings_within_a_few_metres_better(
+    bent, monkeypatch, solved_once, everywhere: float, nearby: float, accepted: bool
+) -> None:
+    monkeypatch.setattr(refinement, 'match_drive', no_matches)
     let_come_back(monkeypatch, lambda scans, nodes: nodes is scans.windows.node)
-    assert not Refiner(Parameters()).run(*bent).accepted
+    monkeypatch.setattr(right_angles, 'gain_over_drive', lambda *rest: Gain(0.001, 0.01))
+    monkeypatch.setattr(right_angles, 'gain_at_revisits', lambda *rest: Gain(0.01 * everywhere, 0.01))
+    monkeypatch.setattr(right_angles, 'gain_within_visits', lambda *rest: Gain(0.01 * nearby, 0.01))
+    monkeypatch.setattr(right_angles, 'accepted_in_folds', lambda *rest: None)
+    found = Refiner(Parameters()).run(*bent)
+    assert found.accepted == accepted
+    if accepted:
+        assert found.reason.startswith('within a few metres, readings are predicted better')
 
 
 @pytest.mark.parametrize(
