@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from ..common.grid import Grid, Window
 from ..common.parameter_groups import ModelParameters
 from ..runtime.cancelling import NEVER
-from ..sensor.incidence import count, edges_of, narrowed, no_counts, slots_of, with_own_angles
+from ..sensor.incidence import count, edges_of, limits_of, narrowed, no_counts, slots_of, with_own_angles
 from ..sensor.surface_normals import SurfaceNormals, gather, normals_of, renewed, window_of_influence
 from .renewal import near
 from .state import State, Work
@@ -25,6 +25,14 @@ NO_INCIDENCE_LIMIT = 1.5707
 def has_limit(model: ModelParameters) -> bool:
     """Return whether there is a limit of the incidence angle; without one, normals do not matter."""
     return model.max_incidence_angle < NO_INCIDENCE_LIMIT
+
+
+def usual_limit(model: ModelParameters) -> float:
+    """Return the limit of the incidence angle of a surface of which nothing is known, radians: the middle one.
+
+    Without a limit, it is `max_incidence_angle`.
+    """
+    return float(np.median(limits_of(model))) if has_limit(model) else model.max_incidence_angle
 
 
 def first_normals(

@@ -1,9 +1,10 @@
 """Free space: the expected number of readings that passed each cell on the way to their cause, by direction.
 
-A surface returns sound only within `max_incidence_angle` of its normal. A reading that passed a cell does not tell of a
-surface there that it would have met at a larger angle, and the normal of a surface in an empty cell is unknown. So
-passes are counted separately for `DIRECTIONS`. Let P_j be the number of passes within this angle of the j-th of J
-normals, which are equally likely. A surface of unknown normal changes the likelihood of these passes by the factor
+A surface returns sound only within some angle of its normal. A reading that passed a cell does not tell of a surface
+there that it would have met at a larger angle. The normal of a surface in an empty cell is unknown, and so is its
+limit: it may be rough or smooth, and the middle one is taken (`usual_limit`). So passes are counted separately for
+`DIRECTIONS`. Let P_j be the number of passes within this angle of the j-th of J normals, which are equally likely. A
+surface of unknown normal changes the likelihood of these passes by the factor
 
     (1 − p_hit)^n = 1/J Σ_j (1 − p_hit)^P_j
 
@@ -21,6 +22,7 @@ from numpy.typing import NDArray
 
 from ..common.readings import Floats
 from ..evidence.evidence import Evidence
+from ..evidence.learned_normals import usual_limit
 from ..evidence.state import State
 from ..runtime.jit import allocating_kernel, inlined_kernel
 from ..sensor.cone import rows_of, runs_of, strength
@@ -48,8 +50,8 @@ def direction_of(u: float, v: float) -> int:
     return 1 if u * v > 0.0 else 3
 
 
-def noticed_by(max_incidence_angle: float) -> Floats:
-    """Return the fraction of each direction, 45° wide, that is within an angle, radians, of each normal.
+def noticed_by(limit: float) -> Floats:
+    """Return the fraction of each direction, 45° wide, that is within a limit, radians, of each normal.
 
     Shape (DIRECTIONS, DIRECTIONS); row j is for the normal along direction j.
     """
@@ -58,10 +60,7 @@ def noticed_by(max_incidence_angle: float) -> Floats:
     out = np.zeros(off.shape)
     # directions are modulo a half turn
     for middle in (off, off - math.pi):
-        low, high = (
-            np.maximum(middle - wide / 2, -max_incidence_angle),
-            np.minimum(middle + wide / 2, max_incidence_angle),
-        )
+        low, high = np.maximum(middle - wide / 2, -limit), np.minimum(middle + wide / 2, limit)
         out += np.maximum(high - low, 0.0) / wide
     return out
 
@@ -219,5 +218,5 @@ def expected_passes(evidence: Evidence, occupied: NDArray[np.uint8]) -> Passes:
     """Return the expected passes of each cell of a map; `occupied` has the shape (cells,)."""
     model, passed = evidence.model, passes_by_direction(evidence, occupied)
     out = Passes(np.empty(evidence.grid.size), np.empty(evidence.grid.size))
-    count_passes(passed, noticed_by(model.max_incidence_angle), model.p_hit, *out)
+    count_passes(passed, noticed_by(usual_limit(model)), model.p_hit, *out)
     return out

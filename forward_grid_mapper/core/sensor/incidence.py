@@ -68,11 +68,19 @@ def no_counts(slots: NDArray[np.int32]) -> NDArray[np.int64]:
     return np.zeros((2 * ZONES, int(slots.max(initial=-1)) + 1), np.int64)
 
 
+def limits_of(model: ModelParameters) -> NDArray[np.float64]:
+    """Return the limits of the incidence angle that a surface may have, radians, increasing; shape (ZONES,) or (1,)."""
+    if model.min_incidence_angle >= model.max_incidence_angle:
+        return np.array([model.max_incidence_angle])
+    return np.linspace(model.min_incidence_angle, model.max_incidence_angle, ZONES)
+
+
 def edges_of(model: ModelParameters) -> NDArray[np.float64] | None:
     """Return the squared cosines at which the zones end, shape (ZONES,); None if all surfaces have the same limit."""
-    if model.min_incidence_angle >= model.max_incidence_angle:
+    limits = limits_of(model)
+    if len(limits) == 1:
         return None
-    out: NDArray[np.float64] = np.cos(np.linspace(model.min_incidence_angle, model.max_incidence_angle, ZONES)) ** 2
+    out: NDArray[np.float64] = np.cos(limits) ** 2
     return out
 
 

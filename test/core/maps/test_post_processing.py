@@ -15,6 +15,7 @@ from forward_grid_mapper.core.common.parameter_groups import ModelParameters
 from forward_grid_mapper.core.common.readings import Readings
 from forward_grid_mapper.core.evidence.evidence import Evidence
 from forward_grid_mapper.core.evidence.fixed_point import QUANTUM
+from forward_grid_mapper.core.evidence.learned_normals import usual_limit
 from forward_grid_mapper.core.maps.free_space import (
     PASS_UNIT,
     count_passes,
@@ -121,6 +122,28 @@ def test_cells_passed_in_one_direction_only_are_unknown() -> None:
     assert far[0] == 10 - round(FREE_GROWTH / 0.1) - round(FREE_MARGIN / 0.1), (
         'as far as it leads on, and a cell beside'
     )
+
+
+@pytest.mark.parametrize(
+    ('most', 'least', 'usual'),
+    [(0.7, 0.3, 0.5), (0.7, 0.7, 0.7), (0.7, 1.5708, 0.7), (1.2, 0.2, 0.7), (math.pi / 2, 0.3, math.pi / 2)],
+)
+def test_unknown_surface_has_the_middle_limit(most: float, least: float, usual: float) -> None:
+    model = plain_model(max_incidence_angle=most, min_incidence_angle=least)
+    assert usual_limit(model) == pytest.approx(usual)
+
+
+@pytest.mark.parametrize(('least', 'free'), [(0.7, True), (0.1, False)])
+def test_beams_in_one_direction_clear_a_cell_only_if_any_surface_would_return_them_at_a_slant(
+    least: float, free: bool
+) -> None:
+    # at 0.7 rad, diagonal surfaces return 39 % of the beams along a row, and at 0.4 rad 1 %
+    beams = {'z': np.full(50, 1.3), 'z_max': 1.3, 'half_angle': 0.02}
+    along = Readings.from_columns(x=0.05, y=0.55, yaw=0.0, **beams)
+    model = plain_model(sigma=0.05, max_incidence_angle=0.7, min_incidence_angle=least)
+    evidence = made(along, model, np.zeros(GRID.shape, np.uint8))
+    actual = post_process(evidence, 0.0, 0.9, 1.0, NOWHERE)
+    assert (actual == 0).any() == free
 
 
 def test_free_space_grows_only_through_passed_cells() -> None:
