@@ -147,7 +147,8 @@ def test_uncertainty_map_is_that_of_the_twin(seed: int) -> None:
     expected = naive.calibrated(
         nats.reshape(grid.shape), passes.sum(axis=0).reshape(grid.shape), c.maps.ml, search.alpha
     )
-    noticing = naive.noticing(passes, c.maps.parameters.model.p_hit, c.maps.parameters.model.max_incidence_angle)
+    model = c.maps.parameters.model
+    noticing = naive.noticing(passes, model.p_hit, naive.usual_limit(model))
     for cell, q in enumerate(c.maps.uncertainty.ravel()):
         if np.isnan(q):
             assert c.maps.ml.ravel()[cell] == -1
@@ -168,11 +169,11 @@ def in_room(x: float, y: float, bearing: float, half: float) -> float:
     return float(np.minimum(across, along).min())
 
 
-@pytest.mark.parametrize('sonars', [1, 3, 8])
-def test_robot_that_turns_on_the_spot_maps_the_room_as_free(sonars: int) -> None:
-    # each place is seen from one direction only
+@pytest.mark.parametrize(('sonars', 'turns'), [(1, 6), (3, 2), (8, 2), (8, 1)])
+def test_robot_that_turns_on_the_spot_maps_the_room_as_free(sonars: int, turns: int) -> None:
+    # each place is seen from one direction only, so it takes about ten readings that pass
     x, y, half = 2.5, 2.2, 0.13
-    bearings = np.arange(144)[:, None] * (2 * np.pi / 72) + np.arange(sonars) * (2 * np.pi / 8)
+    bearings = np.arange(72 * turns)[:, None] * (2 * np.pi / 72) + np.arange(sonars) * (2 * np.pi / 8)
     z = [min(in_room(x, y, bearing, half), 4.0) for bearing in bearings.ravel()]
     readings = Readings.from_columns(x=x, y=y, yaw=bearings.ravel(), z=z, z_max=4.0, half_angle=half)
     maps = Mapper(Parameters()).run(readings)
