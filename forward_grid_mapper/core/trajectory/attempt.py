@@ -20,6 +20,10 @@ ACCURACY, EXACT = Differences(0.15, math.radians(2.0)), Differences(0.0, 0.0)
 Over 4 m, a turn of 2° moves walls by as much."""
 
 
+SMALLEST_GAIN = 0.0005
+"""Smallest gain that is called better or worse, nats a reading: it is written with three decimals."""
+
+
 class Drive(NamedTuple):
     """A drive, its windows and their scans."""
 
@@ -76,6 +80,8 @@ def gain_words(better: Gain) -> str:
     """Return the gain over odometry in words."""
     if not np.isfinite(better.error):
         return 'too few readings overlap with maps of other readings to compare the prediction with that of odometry'
+    if abs(better.mean) < SMALLEST_GAIN:
+        return f'readings are predicted as well as with odometry, to ± {better.error:.3f} nats a reading'
     better_or_worse = 'better' if better.mean >= 0 else 'worse'
     return (
         f'readings are predicted {better_or_worse} than with odometry, by {abs(better.mean):.3f} ± {better.error:.3f} '
