@@ -39,7 +39,10 @@ NAMES = ('building_a', 'building_b', 'building_c', 'office_a', 'office_b')
 DRAWN = range(24, 36)
 """Seeds of buildings that were not used for tuning."""
 
-FIGURES = ('f1', 'precision', 'recall', 'nav_iou', 'leak', 'blocked', 'beyond')
+FLOOR = 'floor'
+"""Fraction of the free cells of the reference that the map shows as free; it falls if they are unknown, too."""
+
+FIGURES = ('f1', 'precision', 'recall', 'nav_iou', 'leak', 'blocked', 'beyond', FLOOR)
 
 
 class Map(NamedTuple):
@@ -70,7 +73,9 @@ def scored(case: Case, changes: dict[str, Any], tool: ModuleType) -> dict[str, l
 
     def figures(grid: Grid, values: NDArray[Any]) -> dict[str, float]:
         p = on_truth(values, grid, case, tool)
-        return dict(tool.score(p, case.truth, path, case.resolution, ROBOT_RADIUS))
+        floor = case.truth == 0.0
+        found = float((p[floor] < 0.5).mean())
+        return {**tool.score(p, case.truth, path, case.resolution, ROBOT_RADIUS), FLOOR: found}
 
     for made in maps_of(case, changes, tool):
         scores = figures(made.grid, made.values)

@@ -504,22 +504,21 @@ def passed(
     return out
 
 
-def usual_limit(model: ModelParameters) -> float:
-    """Limit of the incidence angle of a surface of which nothing is known."""
-    if model.max_incidence_angle >= 1.5707:
-        return model.max_incidence_angle
-    return 0.5 * (min(model.min_incidence_angle, model.max_incidence_angle) + model.max_incidence_angle)
+def usual_limits(model: ModelParameters) -> list[float]:
+    """Limits of the incidence angle of a surface of which nothing is known."""
+    low, high = model.min_incidence_angle, model.max_incidence_angle
+    return [high] if high >= 1.5707 or low >= high else [0.5 * (low + high), high]
 
 
-def noticing(passes: np.ndarray, p_hit: float, limit: float) -> np.ndarray:
+def noticing(passes: np.ndarray, p_hit: float, limits: list[float]) -> np.ndarray:
     """Expected number of passes that any surface would have noticed, shape (4, cells), by trying all bearings."""
     bearings = (np.arange(18000) + 0.5) * math.pi / 18000
     nearest = np.round(bearings / (math.pi / 4)).astype(int) % 4
     out = np.zeros(passes.shape[1])
-    for normal in np.arange(4) * math.pi / 4:
+    for normal, limit in itertools.product(np.arange(4) * math.pi / 4, limits):
         off = np.abs((bearings - normal + math.pi / 2) % math.pi - math.pi / 2)
         share = [np.mean(off[nearest == way] < limit) for way in range(4)]
-        out += (1 - p_hit) ** (np.array(share) @ passes) / 4
+        out += (1 - p_hit) ** (np.array(share) @ passes) / (4 * len(limits))
     with np.errstate(divide='ignore'):
         return np.log(out) / math.log(1 - p_hit)
 
@@ -619,7 +618,7 @@ def final_map(
     ml[traversed & (ml < 0)] = 0
     passes = passed(readings, grid, occupied, model)
     through = (ml == 0) & (traversed | (passes.sum(axis=0).reshape(grid.shape) >= least[0]))
-    noticed = noticing(passes, model.p_hit, usual_limit(model)).reshape(grid.shape) >= least[1]
+    noticed = noticing(passes, model.p_hit, usual_limits(model)).reshape(grid.shape) >= least[1]
     known = (ml == 0) & (traversed | (noticed & through))
     for _ in range(round(FREE_GROWTH / 0.1)):
         known = through & (box_sum(known.astype(int)) > 0)

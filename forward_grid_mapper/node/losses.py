@@ -90,11 +90,10 @@ class Losses:
         self._add(dropped=1)
 
     def _add(self, in_gaps: int = 0, reported: int = 0, dropped: int = 0) -> None:
-        before = self.lost
         self._in_gaps += in_gaps
         self._reported += reported
         self._dropped += dropped
-        if self.lost > before:
+        if in_gaps or reported or dropped:
             self.recent = time.monotonic()
 
     def _by_number(self, number: int) -> int:

@@ -148,7 +148,7 @@ def test_uncertainty_map_is_that_of_the_twin(seed: int) -> None:
         nats.reshape(grid.shape), passes.sum(axis=0).reshape(grid.shape), c.maps.ml, search.alpha
     )
     model = c.maps.parameters.model
-    noticing = naive.noticing(passes, model.p_hit, naive.usual_limit(model))
+    noticing = naive.noticing(passes, model.p_hit, naive.usual_limits(model))
     for cell, q in enumerate(c.maps.uncertainty.ravel()):
         if np.isnan(q):
             assert c.maps.ml.ravel()[cell] == -1
@@ -169,9 +169,9 @@ def in_room(x: float, y: float, bearing: float, half: float) -> float:
     return float(np.minimum(across, along).min())
 
 
-@pytest.mark.parametrize(('sonars', 'turns'), [(1, 6), (3, 2), (8, 2), (8, 1)])
+@pytest.mark.parametrize(('sonars', 'turns'), [(1, 4), (3, 2), (8, 1)])
 def test_robot_that_turns_on_the_spot_maps_the_room_as_free(sonars: int, turns: int) -> None:
-    # each place is seen from one direction only, so it takes about ten readings that pass
+    # each place is seen from one direction only, so it takes about seven readings that pass
     x, y, half = 2.5, 2.2, 0.13
     bearings = np.arange(72 * turns)[:, None] * (2 * np.pi / 72) + np.arange(sonars) * (2 * np.pi / 8)
     z = [min(in_room(x, y, bearing, half), 4.0) for bearing in bearings.ravel()]

@@ -85,6 +85,8 @@ def test_losses_reported_before_their_gap_are_counted_once() -> None:
     assert losses.lost == 5
     losses.dropped()
     assert losses.lost == 6, 'what the node drops has arrived, so it is in neither of the other counts'
+    losses.clear()
+    assert losses.lost == 0
 
 
 def test_losses_reported_after_their_gap_are_counted_once() -> None:

@@ -147,8 +147,10 @@ class ModelParameters:
     min_incidence_angle: float = constant(
         0.31,
         1.5708,
-        'Smallest limit of the incidence angle that is estimated for a surface, as for a smooth wall or glass. If it '
-        'is max_incidence_angle or more, all surfaces have max_incidence_angle.',
+        'Smallest limit of the incidence angle that is estimated for a surface, as for a smooth wall or glass. A '
+        'surface in an empty cell has the middle of both limits or max_incidence_angle, so a cell that is seen in one '
+        'direction needs more readings to be free. If it is max_incidence_angle or more, all surfaces have '
+        'max_incidence_angle.',
         'rad',
     )
     surface_offset: float = constant(

@@ -27,12 +27,14 @@ def has_limit(model: ModelParameters) -> bool:
     return model.max_incidence_angle < NO_INCIDENCE_LIMIT
 
 
-def usual_limit(model: ModelParameters) -> float:
-    """Return the limit of the incidence angle of a surface of which nothing is known, radians: the middle one.
+def usual_limits(model: ModelParameters) -> list[float]:
+    """Return the limits of the incidence angle that a surface of which nothing is known may have, radians.
 
-    Without a limit, it is `max_incidence_angle`.
+    They are equally likely. The smallest one is left out: with it, no place would be free that is seen in one direction
+    only, as by a robot that turns on the spot.
     """
-    return float(np.median(limits_of(model))) if has_limit(model) else model.max_incidence_angle
+    limits = limits_of(model).tolist() if has_limit(model) else [model.max_incidence_angle]
+    return limits[1:] or limits
 
 
 def first_normals(

@@ -2,14 +2,14 @@
 
 A surface returns sound only within some angle of its normal. A reading that passed a cell does not tell of a surface
 there that it would have met at a larger angle. The normal of a surface in an empty cell is unknown, and so is its
-limit: it may be rough or smooth, and the middle one is taken (`usual_limit`). So passes are counted separately for
-`DIRECTIONS`. Let P_j be the number of passes within this angle of the j-th of J normals, which are equally likely. A
-surface of unknown normal changes the likelihood of these passes by the factor
+limit, since it may be rough or smooth (`usual_limits`). So passes are counted separately for `DIRECTIONS`. Let P_j be
+the number of passes that the j-th of J surfaces, which are equally likely, would notice: those within its limit of its
+normal. Such an unknown surface changes the likelihood of these passes by the factor
 
     (1 − p_hit)^n = 1/J Σ_j (1 − p_hit)^P_j
 
 which is that of n readings that would detect a surface of any normal. If all readings have the same direction, n is
-less than one, however many they are. Without a limit of the incidence angle, n is their number.
+small, however many they are. Without a limit of the incidence angle, n is their number.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from ..common.readings import Floats
 from ..evidence.evidence import Evidence
-from ..evidence.learned_normals import usual_limit
+from ..evidence.learned_normals import usual_limits
 from ..evidence.state import State
 from ..runtime.jit import allocating_kernel, inlined_kernel
 from ..sensor.cone import rows_of, runs_of, strength
@@ -157,8 +157,8 @@ def count_passes(passed: Any, noticed: Any, p_hit: float, whole: Any, out: Any) 
     ----------
     passed : int64, shape (DIRECTIONS, cells)
         From `add_passes`.
-    noticed : float64, shape (DIRECTIONS, DIRECTIONS)
-        From `noticed_by`.
+    noticed : float64, shape (J, DIRECTIONS)
+        Rows of `noticed_by`, for all surfaces that are equally likely.
     p_hit : float
         Of the surface.
     whole, out : float64, shape (cells,)
@@ -167,10 +167,11 @@ def count_passes(passed: Any, noticed: Any, p_hit: float, whole: Any, out: Any) 
     each, miss = np.empty(len(noticed)), math.log(1.0 - p_hit)
     for c in range(len(out)):
         least, whole[c] = np.inf, 0.0
+        for k in range(len(passed)):
+            whole[c] += passed[k, c] * PASS_UNIT
         for j in range(len(noticed)):
-            whole[c] += passed[j, c] * PASS_UNIT
             each[j] = 0.0
-            for k in range(len(noticed)):
+            for k in range(len(passed)):
                 each[j] += noticed[j, k] * passed[k, c]
             each[j] *= PASS_UNIT
             least = min(least, each[j])
@@ -218,5 +219,5 @@ def expected_passes(evidence: Evidence, occupied: NDArray[np.uint8]) -> Passes:
     """Return the expected passes of each cell of a map; `occupied` has the shape (cells,)."""
     model, passed = evidence.model, passes_by_direction(evidence, occupied)
     out = Passes(np.empty(evidence.grid.size), np.empty(evidence.grid.size))
-    count_passes(passed, noticed_by(usual_limit(model)), model.p_hit, *out)
+    count_passes(passed, np.concatenate([noticed_by(limit) for limit in usual_limits(model)]), model.p_hit, *out)
     return out

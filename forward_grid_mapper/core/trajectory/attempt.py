@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..common.readings import Floats, Readings
-from .holding_out import Gain
+from .holding_out import LEAST_SIGMAS, Gain
 from .outcome import Differences, Refinement
 from .poses import compose, inverse
 from .scans import Scans
@@ -21,7 +21,7 @@ Over 4 m, a turn of 2° moves walls by as much."""
 
 
 SMALLEST_GAIN = 0.0005
-"""Smallest gain that is called better or worse, nats a reading: it is written with three decimals."""
+"""Smallest gain that is called better or worse if it is not significant, nats a reading; it has three decimals."""
 
 
 class Drive(NamedTuple):
@@ -80,7 +80,7 @@ def gain_words(better: Gain) -> str:
     """Return the gain over odometry in words."""
     if not np.isfinite(better.error):
         return 'too few readings overlap with maps of other readings to compare the prediction with that of odometry'
-    if abs(better.mean) < SMALLEST_GAIN:
+    if abs(better.mean) < SMALLEST_GAIN and abs(better.sigmas) < LEAST_SIGMAS:
         return f'readings are predicted as well as with odometry, to ± {better.error:.3f} nats a reading'
     better_or_worse = 'better' if better.mean >= 0 else 'worse'
     return (

@@ -15,7 +15,7 @@ from forward_grid_mapper.core.common.parameter_groups import ModelParameters
 from forward_grid_mapper.core.common.readings import Readings
 from forward_grid_mapper.core.evidence.evidence import Evidence
 from forward_grid_mapper.core.evidence.fixed_point import QUANTUM
-from forward_grid_mapper.core.evidence.learned_normals import usual_limit
+from forward_grid_mapper.core.evidence.learned_normals import usual_limits
 from forward_grid_mapper.core.maps.free_space import (
     PASS_UNIT,
     count_passes,
@@ -77,16 +77,16 @@ def test_expected_passes_are_those_of_the_twin(seed: int, filled: float) -> None
 
 
 @pytest.mark.parametrize('seed', range(8))
-@pytest.mark.parametrize('angle', [0.1, 0.3, 0.7, 1.2, 1.5])
-def test_noticing_passes_are_those_of_the_twin(seed: int, angle: float) -> None:
+@pytest.mark.parametrize('angles', [[0.1], [0.3], [0.7], [1.5], [0.5, 0.7], [0.2, 0.7, 1.2]])
+def test_noticing_passes_are_those_of_the_twin(seed: int, angles: list[float]) -> None:
     rng = np.random.default_rng(seed)
     passes = np.where(rng.random((4, 50)) < 0.3, 0.0, rng.gamma(0.7, 3.0, (4, 50)))
     passes[:, :2] *= 1000.0
     passed, whole, out = np.round(passes / PASS_UNIT).astype(np.int64), np.empty(50), np.empty(50)
     p_hit = rng.choice([0.05, 0.65, 0.98])
-    count_passes(passed, noticed_by(angle), p_hit, whole, out)
+    count_passes(passed, np.concatenate([noticed_by(angle) for angle in angles]), p_hit, whole, out)
     assert np.array_equal(whole, passed.sum(axis=0) * PASS_UNIT)
-    expected = naive.noticing(passed * PASS_UNIT, p_hit, angle)
+    expected = naive.noticing(passed * PASS_UNIT, p_hit, angles)
     finite = np.isfinite(expected)
     assert finite[2:].all()
     assert out[finite] == pytest.approx(expected[finite], rel=5e-3, abs=2e-3)
@@ -126,11 +126,17 @@ def test_cells_passed_in_one_direction_only_are_unknown() -> None:
 
 @pytest.mark.parametrize(
     ('most', 'least', 'usual'),
-    [(0.7, 0.3, 0.5), (0.7, 0.7, 0.7), (0.7, 1.5708, 0.7), (1.2, 0.2, 0.7), (math.pi / 2, 0.3, math.pi / 2)],
+    [
+        (0.7, 0.3, [0.5, 0.7]),
+        (0.7, 0.7, [0.7]),
+        (0.7, 1.5708, [0.7]),
+        (1.2, 0.2, [0.7, 1.2]),
+        (math.pi / 2, 0.3, [math.pi / 2]),
+    ],
 )
-def test_unknown_surface_has_the_middle_limit(most: float, least: float, usual: float) -> None:
+def test_unknown_surface_has_one_of_the_larger_limits(most: float, least: float, usual: list[float]) -> None:
     model = plain_model(max_incidence_angle=most, min_incidence_angle=least)
-    assert usual_limit(model) == pytest.approx(usual)
+    assert usual_limits(model) == pytest.approx(usual)
 
 
 @pytest.mark.parametrize(('least', 'free'), [(0.7, True), (0.1, False)])

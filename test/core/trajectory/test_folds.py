@@ -147,8 +147,11 @@ def test_trajectory_that_tears_apart_must_be_better_nearby_as_well(
     scans, monkeypatch, everywhere: float, nearby: float, solved: int, accepted: bool
 ) -> None:
     trial = Folds(monkeypatch, scans, [everywhere] * 3, [True, False, False, False], nearby)
-    assert (trial.judged() is not None) == accepted
+    found = trial.judged()
+    assert (found is not None) == accepted
     assert len(trial.held_out) == solved
+    if found is not None:
+        assert 0.0 < found.refinement.gain < 2.0, 'that of the less clear comparison is stated'
 
 
 @pytest.mark.parametrize(('nearby', 'accepted'), [(-1.3, True), (-1.5, False)])

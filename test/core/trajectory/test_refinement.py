@@ -77,6 +77,7 @@ def test_unknown_gain_is_reported_without_a_number() -> None:
     assert gain_words(Gain(0.0004, 0.003)) == gain_words(Gain(-0.0004, 0.003))
     assert 'as well as with odometry, to ± 0.003 nats' in gain_words(Gain(-0.0004, 0.003))
     assert 'worse than with odometry, by 0.001 ± 0.003' in gain_words(Gain(-0.0006, 0.003))
+    assert 'better than with odometry' in gain_words(Gain(0.0004, 0.0001)), 'it is significant'
 
 
 def test_drift_is_corrected(tour, bent, outcome, stages) -> None:
@@ -343,6 +344,7 @@ def test_trajectory_that_tears_apart_must_predict_readings_within_a_few_metres_b
     assert found.accepted == accepted
     if accepted:
         assert found.reason.startswith('within a few metres, readings are predicted better')
+        assert found.gain == pytest.approx(0.01 * nearby)
 
 
 @pytest.mark.parametrize(
