@@ -32,6 +32,7 @@ from .passes import Progress
 from .pose_graph import Solution
 from .poses import rms_after_alignment
 from .relocating import LEAST_RECOGNISED, confirmed_by_places, recognised, recognised_part
+from .repeated_errors import are_walls_bent
 from .scans import Scans
 from .solving import SETTLED, Solver
 from .walls import wall_votes
@@ -56,6 +57,13 @@ NOT_ENOUGH = ': this does not show that odometry is wrong'
 NO_WALLS = (
     'the echoes do not agree on directions of walls: this needs walls at right angles to each other beside the robot, '
     'and odometry with an accurate yaw over a few metres'
+)
+
+UNMATCHED = '; it comes from walls alone, without loop closures: with these, readings are predicted worse'
+
+BENT = (
+    'walls at right angles do not fit: along them, odometry would make the same error whenever the robot comes to the '
+    'same place, so the walls there are bent, or at other angles'
 )
 
 
@@ -116,11 +124,15 @@ class _Verdict(NamedTuple):
 
 
 class _Candidate(NamedTuple):
-    """Nodes to be judged, shape (K, 3), the calibration, and the loop closures that they fulfil."""
+    """Nodes to be judged, shape (K, 3), the calibration, and the loop closures that they fulfil.
+
+    `matched` is whether they come from scan matching and loop closures, too, and not from walls alone.
+    """
 
     nodes: Floats
     calibration: dict[str, float]
     loops: list[Loop]
+    matched: bool = True
 
 
 def at_right_angles(
@@ -129,6 +141,7 @@ def at_right_angles(
     least: Differences,
     start_stage: Callable[[str], Progress],
     odometry_is_wrong: bool = False,
+    match_anyway: bool = False,
 ) -> Attempt:
     """Return the trajectory with walls at right angles to each other, or why there is none.
 
@@ -143,6 +156,8 @@ def at_right_angles(
         Receives the name of a stage, and returns the callable that receives its progress.
     odometry_is_wrong : bool
         Whether this is known, so that the trajectory need not show it.
+    match_anyway : bool
+        Whether the drive is matched, and then judged, even if nothing shows before that odometry is wrong.
     """
     found_heading, vote_gain = heading_of_walls(
         drive.windows, drive.scans, odometry_noise, start_stage('directions of walls')
@@ -152,7 +167,7 @@ def at_right_angles(
     solver_of = partial(_solver_of, drive, start_stage)
     walls = _along_walls(drive, found_heading, vote_gain, solver_of(found_heading), start_stage)
     # matching takes most of the time, and is left out if nothing supports its result
-    if not (walls.proven or walls.votes_suffice or odometry_is_wrong):
+    if not (walls.proven or walls.votes_suffice or odometry_is_wrong or match_anyway):
         if walls.heading.certainty < LEAST_CERTAINTY:
             return _heading_lost(drive, walls.heading.certainty)
         if walls.vote_gain <= LEAST_VOTE_GAIN:
@@ -261,7 +276,7 @@ def _best_of(drive: Drive, walls: _AlongWalls, found: Solved) -> _Candidate:
     nodes = last_not_worse(drive.scans, simple, found.along.nodes, found.solution.nodes)
     if nodes is found.solution.nodes:
         return _Candidate(nodes, _by_name(solver.calibration_of(found.solution)), found.loops)
-    return _Candidate(nodes, walls.calibration, [])
+    return _Candidate(nodes, walls.calibration, [], matched=False)
 
 
 def _kept(
@@ -345,9 +360,11 @@ def _accepted(drive: Drive, best: _Candidate, verdict: _Verdict, noise: float, l
     if off.within(least):
         reason = f'odometry is off by {off.moved:.2f} m, which is not more than the accuracy of sonar'
         return _kept(drive, reason, best.calibration, verdict.gain.mean, sure=True)
+    if are_walls_bent(windows, best.nodes):
+        return _kept(drive, BENT, gain=verdict.gain.mean)._replace(start=best.nodes)
     outcome = Refinement(
         True,
-        verdict.words,
+        verdict.words if best.matched else verdict.words + UNMATCHED,
         replaced(readings, odometry, trajectory),
         trajectory,
         best.calibration,
