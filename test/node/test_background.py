@@ -186,7 +186,7 @@ def test_call_of_a_closed_worker_raises(worker: Worker) -> None:
 
 
 @pytest.mark.skipif(sys.platform != 'linux', reason='elsewhere a thread has no priority of its own')
-@pytest.mark.parametrize('nice', [NICE, 0])
+@pytest.mark.parametrize('nice', [NICE, 15, 0])
 def test_worker_has_the_given_priority(nice: int) -> None:
     worker = Worker('digger', logged.append, nice=nice)
     own = os.getpriority(os.PRIO_PROCESS, 0)
