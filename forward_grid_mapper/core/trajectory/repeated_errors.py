@@ -2,28 +2,37 @@
 
 Wheels do not know where they are. So along the right trajectory, the errors of the yaw of odometry in two visits of a
 place are independent, once the mean error is subtracted. If a bent corridor was taken for a straight one, odometry
-seems to turn by the same angle in the same place, again and again: to the left on the way out, to the right on the way
-back. With errors a_i and b_i of n stretches that were driven twice, b_i turned around if the robot came from the other
-side,
+seems to turn by the same angle in the same place again: to the left on the way out, to the right on the way back. Let
+n stretches be driven twice, with the errors a_i and b_i; those of a visit from the other side are turned around. There
+are two tests.
+
+A corridor may bend all along to one side. For stretches that were driven in both directions, with c_i = (a_i + b_i) / 2
+and d_i = (a_i − b_i) / 2, which have the same variance if the errors are independent,
+
+    t = c̄ / √(s² / n)        s² = (Σ (c_i − c̄)² + Σ d_i²) / (2n − 1)
+
+A constant error of the wheels has no part in c̄. In general,
 
     r = Σ a_i b_i / √(Σ a_i² Σ b_i²)        atanh r ~ N(0, 1 / (n − 2))
 
 if they are independent (Fisher's transformation, for variables of mean 0). Small errors repeat themselves as well, as
-where walls are not quite parallel; so their root mean square Σ a_i b_i / n counts, too.
+where walls are not quite parallel, so there is a smallest bend in both tests.
 """
 
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ..common.readings import Floats
 from .holding_out import REVISIT_AFTER
 from .poses import wrapped
 from .windows import Windows
 
-STRETCH = 4.0
+STRETCH = 3.0
 """Metres over which an error of the yaw is measured."""
 
 MOST_TURN = math.radians(25.0)
@@ -32,61 +41,90 @@ MOST_TURN = math.radians(25.0)
 SAME_PLACE, SAME_AXIS = 1.0, math.radians(30.0)
 """Largest distance of the middles of two stretches, metres, and largest angle between them."""
 
-LEAST_SIGMAS = 3.0
-"""Least atanh r in its standard deviations."""
-
-LEAST_BEND = math.radians(0.6)
-"""Least bend that counts, radians a metre: a radius of 95 m."""
-
 FEWEST_STRETCHES = 4
 """Fewest stretches that were driven twice."""
 
+LEAST_T, LEAST_MEAN_BEND = 3.5, math.radians(0.5)
+"""Least t, and least mean bend to one side, radians a metre: a radius of 115 m."""
+
+LEAST_SIGMAS, LEAST_BEND = 3.0, math.radians(0.6)
+"""Least atanh r in its standard deviations, and least bend √(Σ a_i b_i / n), radians a metre."""
+
+
+class RepeatedErrors(NamedTuple):
+    """Errors of the yaw of odometry in n stretches that were driven twice, radians, without the mean error.
+
+    Attributes
+    ----------
+    earlier, later : float64, shape (n,)
+        In the direction of the earlier visit.
+    opposite : bool, shape (n,)
+        Whether the robot came from the other side on the later visit.
+    """
+
+    earlier: Floats
+    later: Floats
+    opposite: NDArray[np.bool_]
+
+    @property
+    def mean_bend(self) -> tuple[float, float]:
+        """The mean bend to one side, radians a metre, and its t; zeros if too few stretches tell."""
+        a, b = self.later[self.opposite], self.earlier[self.opposite]
+        n = len(a)
+        if n < FEWEST_STRETCHES:
+            return 0.0, 0.0
+        both, half = (a + b) / 2, (a - b) / 2
+        mean = float(both.mean())
+        error = math.sqrt((((both - mean) ** 2).sum() + (half**2).sum()) / (2 * n - 1) / n)
+        return abs(mean) / STRETCH, abs(mean) / max(error, 1e-9)
+
+    @property
+    def common_bend(self) -> tuple[float, float]:
+        """What both visits have in common, radians a metre, and how significant it is, σ; zeros if too few tell."""
+        n = len(self.later)
+        together = float((self.later * self.earlier).sum())
+        if n < FEWEST_STRETCHES or together <= 0.0:
+            return 0.0, 0.0
+        r = together / math.sqrt(float((self.later**2).sum() * (self.earlier**2).sum()))
+        return math.sqrt(together / n) / STRETCH, math.atanh(min(r, 0.999)) * math.sqrt(n - 2)
+
 
 def are_walls_bent(windows: Windows, nodes: Floats) -> bool:
-    """Return whether odometry seems to make the same error again and again at places along nodes of shape (K, 3)."""
-    first, second = repeated_errors(windows, nodes)
-    if len(first) < FEWEST_STRETCHES:
-        return False
-    together = float((first * second).mean())
-    if together < (LEAST_BEND * STRETCH) ** 2:
-        return False
-    r = together / math.sqrt(float((first**2).mean() * (second**2).mean()))
-    return math.atanh(min(r, 0.999)) * math.sqrt(len(first) - 2) >= LEAST_SIGMAS
+    """Return whether odometry seems to make the same errors at the same places along nodes of shape (K, 3)."""
+    found = repeated_errors(windows, nodes)
+    bend, t = found.mean_bend
+    if bend >= LEAST_MEAN_BEND and t >= LEAST_T:
+        return True
+    bend, sigmas = found.common_bend
+    return bend >= LEAST_BEND and sigmas >= LEAST_SIGMAS
 
 
-def repeated_errors(windows: Windows, nodes: Floats) -> tuple[Floats, Floats]:
-    """Return the errors of the yaw of odometry in stretches that were driven twice, on the later and the earlier visit.
-
-    Shape (n,) each, radians, without the mean error; those of an earlier visit from the other side are turned around.
-    Stretches of the later visits do not overlap.
-    """
+def repeated_errors(windows: Windows, nodes: Floats) -> RepeatedErrors:
+    """Return the errors in stretches that were driven twice; no two of them overlap."""
     travel = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(nodes[:, :2], axis=0).T))])
     yaw = np.unwrap(nodes[:, 2])
-    error = np.unwrap(windows.node[:, 2] - nodes[:, 2])
-    begin = np.searchsorted(travel, travel - STRETCH / 2)
-    end = np.searchsorted(travel, travel + STRETCH / 2)
-    whole = (travel >= STRETCH / 2) & (travel <= travel[-1] - STRETCH / 2)
-    straight = np.array(
-        [bool(k) and np.ptp(yaw[i : j + 1]) <= MOST_TURN for k, i, j in zip(whole, begin, end, strict=True)], np.bool_
-    )
-    if not straight.any():
-        return np.empty(0), np.empty(0)
-    own = np.zeros(len(nodes))
-    own[straight] = error[end[straight]] - error[begin[straight]]
-    own -= own[straight].mean()
-    later, earlier = [], []
-    after = 0.0
-    for k in np.flatnonzero(straight):
-        if travel[k] < after:
-            continue
-        off = np.hypot(*(nodes[:, :2] - nodes[k, :2]).T)
+    begin, end = (np.searchsorted(travel, travel + side * STRETCH / 2) for side in (-1.0, 1.0))
+    usable = end < len(nodes)
+    usable &= travel >= STRETCH / 2
+    for k in np.flatnonzero(usable).tolist():
+        usable[k] = np.ptp(yaw[begin[k] : end[k] + 1]) <= MOST_TURN
+    off = np.unwrap(windows.node[:, 2] - nodes[:, 2])
+    error = np.zeros(len(nodes))
+    error[usable] = off[end[usable]] - off[begin[usable]]
+    if usable.any():
+        error -= error[usable].mean()
+    found, left = list[tuple[float, float, bool]](), usable.copy()
+    for k in np.flatnonzero(usable).tolist():
+        distance = np.hypot(*(nodes[:, :2] - nodes[k, :2]).T)
         angle = np.abs(wrapped(yaw - yaw[k]))
-        same = straight & (travel < travel[k] - REVISIT_AFTER) & (off < SAME_PLACE)
+        same = left & (travel < travel[k] - REVISIT_AFTER) & (distance < SAME_PLACE)
         same &= np.minimum(angle, math.pi - angle) < SAME_AXIS
-        if not same.any():
+        if not left[k] or not same.any():
             continue
-        other = int(np.argmin(np.where(same, off, np.inf)))
-        later.append(own[k])
-        earlier.append(own[other] if angle[other] < math.pi / 2 else -own[other])
-        after = travel[k] + STRETCH
-    return np.array(later), np.array(earlier)
+        other = int(np.argmin(np.where(same, distance, np.inf)))
+        opposite = bool(angle[other] > math.pi / 2)
+        found.append((error[other], -error[k] if opposite else error[k], opposite))
+        for used in (k, other):
+            left &= np.abs(travel - travel[used]) >= STRETCH
+    table = np.array(found, np.float64).reshape(-1, 3)
+    return RepeatedErrors(table[:, 0], table[:, 1], table[:, 2] > 0.0)

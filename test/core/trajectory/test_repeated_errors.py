@@ -10,7 +10,15 @@ import numpy as np
 import pytest
 
 from forward_grid_mapper.core.common.readings import Floats
-from forward_grid_mapper.core.trajectory.repeated_errors import LEAST_BEND, STRETCH, are_walls_bent, repeated_errors
+from forward_grid_mapper.core.trajectory.repeated_errors import (
+    FEWEST_STRETCHES,
+    LEAST_BEND,
+    LEAST_MEAN_BEND,
+    STRETCH,
+    RepeatedErrors,
+    are_walls_bent,
+    repeated_errors,
+)
 
 STEP = 0.4
 
@@ -29,7 +37,7 @@ def out_and_back(metres: float, rounds: int = 1) -> tuple[Floats, Floats]:
     return np.column_stack([x, np.zeros(len(x)), yaw]), x
 
 
-@pytest.mark.parametrize(('degrees', 'bent'), [(1.2, True), (-1.2, True), (0.4, False), (0.0, False)])
+@pytest.mark.parametrize(('degrees', 'bent'), [(1.2, True), (-1.2, True), (0.8, True), (0.2, False), (0.0, False)])
 @pytest.mark.parametrize('bias', [0.0, 1.5])
 def test_corridor_that_bends_as_a_whole_is_detected(degrees: float, bent: bool, bias: float) -> None:
     """Odometry turns to one side on the way out, and to the other one on the way back."""
@@ -40,42 +48,71 @@ def test_corridor_that_bends_as_a_whole_is_detected(degrees: float, bent: bool, 
     assert are_walls_bent(windows, nodes) == bent
 
 
-def test_independent_errors_are_hardly_ever_taken_for_bent_walls() -> None:
-    nodes, x = out_and_back(36.0, 2)
+def test_corridor_that_bends_to_both_sides_is_detected() -> None:
+    nodes, x = out_and_back(60.0)
+    noise = np.random.default_rng(3).normal(0.0, math.radians(0.7 * math.sqrt(STEP)), len(x)).cumsum()
+    windows = windows_with(nodes[:, 2] + 0.24 * np.sin(x / 8.0) + noise)
+    found = repeated_errors(windows, nodes)
+    assert found.mean_bend[0] < LEAST_MEAN_BEND and found.common_bend[0] > LEAST_BEND
+    assert are_walls_bent(windows, nodes)
+
+
+@pytest.mark.parametrize('noise', [0.7, 3.0])
+@pytest.mark.parametrize('rounds', [1, 3])
+def test_independent_errors_are_hardly_ever_taken_for_bent_walls(noise: float, rounds: int) -> None:
+    nodes, x = out_and_back(36.0, rounds)
     rng, found = np.random.default_rng(0), 0
     for _ in range(300):
-        drift = rng.normal(0.0, math.radians(3.0 * math.sqrt(STEP)), len(x)).cumsum()
+        drift = rng.normal(0.0, math.radians(noise * math.sqrt(STEP)), len(x)).cumsum()
         found += are_walls_bent(windows_with(nodes[:, 2] + drift), nodes)
     assert found <= 6
 
 
-@pytest.mark.parametrize('turned', [1.0, -1.0])
-def test_visits_in_both_directions_are_compared(turned: float) -> None:
-    """Each error is that of its stretch, and the sign of one from the other side is turned around."""
+def test_gains_are_those_of_the_formulas() -> None:
+    rng = np.random.default_rng(1)
+    a, b = rng.normal(0.05, 0.03, (2, 9))
+    opposite = np.arange(9) != 4
+    found = RepeatedErrors(b, a, opposite)
+    c, d = ((a + b) / 2)[opposite], ((a - b) / 2)[opposite]
+    s2 = (sum((each - sum(c) / 8) ** 2 for each in c) + sum(each**2 for each in d)) / 15
+    assert found.mean_bend == pytest.approx((sum(c) / 8 / STRETCH, sum(c) / 8 / math.sqrt(s2 / 8)))
+    r = sum(a * b) / math.sqrt(sum(a**2) * sum(b**2))
+    assert found.common_bend == pytest.approx((math.sqrt(sum(a * b) / 9) / STRETCH, math.atanh(r) * math.sqrt(7)))
+    few = FEWEST_STRETCHES - 1
+    assert RepeatedErrors(b[:few], a[:few], opposite[:few]).mean_bend == (0.0, 0.0)
+    assert RepeatedErrors(b[:few], a[:few], opposite[:few]).common_bend == (0.0, 0.0)
+    assert RepeatedErrors(-b, a, opposite).common_bend == (0.0, 0.0)
+
+
+@pytest.mark.parametrize('back', [False, True])
+def test_errors_are_those_of_their_stretches(back: bool) -> None:
+    """The sign of one from the other side is turned around, and no stretch is used twice."""
     out = np.arange(0.0, 40.0, STEP)
-    second = out if turned > 0 else out[::-1]
-    nodes = np.zeros((2 * len(out) + 30, 3))
-    # a detour far from the corridor in between
-    nodes[:, 0] = np.concatenate([out, np.full(30, 20.0), second])
-    nodes[len(out) : len(out) + 30, 1] = 50.0 + STEP * np.arange(30)
-    nodes[len(out) : len(out) + 30, 2] = math.pi / 2
-    nodes[len(out) + 30 :, 2] = 0.0 if turned > 0 else math.pi
-    bend = 0.1 * np.sin(nodes[:, 0] / 5.0)
-    first, again = repeated_errors(windows_with(nodes[:, 2] + bend), nodes)
-    assert len(first) == pytest.approx(40.0 / STRETCH, abs=1.5)
-    off = 2.0 * abs(float(np.mean(np.concatenate([first, turned * again]))))
-    assert first == pytest.approx(again, abs=off + 0.02)
-    assert np.corrcoef(first, again)[0, 1] > 0.95
+    detour = 30
+    nodes = np.zeros((2 * len(out) + detour, 3))
+    # far from the corridor in between
+    nodes[:, 0] = np.concatenate([out, np.full(detour, 20.0), out[::-1] if back else out])
+    nodes[len(out) : len(out) + detour, 1] = 50.0 + STEP * np.arange(detour)
+    nodes[len(out) : len(out) + detour, 2] = math.pi / 2
+    nodes[len(out) + detour :, 2] = math.pi if back else 0.0
+    place = nodes[:, 0] / 5.0
+    found = repeated_errors(windows_with(nodes[:, 2] + 0.1 * np.sin(place)), nodes)
+    assert len(found.later) == pytest.approx(40.0 / STRETCH, abs=2.0)
+    assert found.opposite.all() == back and found.opposite.any() == back
+    # both in the direction of the first visit, but for the mean error, which has the direction of driving
+    apart = found.later - found.earlier
+    assert apart == pytest.approx(apart.mean(), abs=0.02)
+    assert np.ptp(found.later) == pytest.approx(2 * 0.1 * 2 * math.sin(STRETCH / 10.0), rel=0.15)
 
 
 def test_turns_and_single_visits_are_left_out() -> None:
     nodes, x = out_and_back(36.0)
     once = nodes[: len(nodes) // 2]
-    assert [len(part) for part in repeated_errors(windows_with(once[:, 2]), once)] == [0, 0]
+    assert not len(repeated_errors(windows_with(once[:, 2]), once).later)
     weaving = nodes.copy()
     weaving[:, 2] += math.radians(20.0) * np.sin(2 * math.pi * x / 4.0)
-    assert [len(part) for part in repeated_errors(windows_with(weaving[:, 2]), weaving)] == [0, 0]
-    assert not are_walls_bent(windows_with(weaving[:, 2]), weaving)
+    assert not len(repeated_errors(windows_with(weaving[:, 2]), weaving).later)
+    assert not are_walls_bent(windows_with(weaving[:, 2] + x), weaving)
     short = nodes[:5]
     assert not are_walls_bent(windows_with(short[:, 2] + x[:5]), short)
 
@@ -84,4 +121,4 @@ def test_small_bends_do_not_count() -> None:
     """Walls that are not quite parallel repeat themselves exactly, too."""
     nodes, x = out_and_back(36.0)
     for factor, bent in ((0.9, False), (1.2, True)):
-        assert are_walls_bent(windows_with(nodes[:, 2] + factor * LEAST_BEND * x), nodes) == bent
+        assert are_walls_bent(windows_with(nodes[:, 2] + factor * LEAST_MEAN_BEND * x), nodes) == bent
