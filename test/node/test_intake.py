@@ -92,6 +92,14 @@ def test_too_many_waiting_messages_before_the_begin_are_rejected(monkeypatch: py
     assert robot.associator.odometry_received == 5
 
 
+def test_odometry_that_is_not_kept_adds_to_what_the_middleware_lost(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(module, 'MOST_WAITING', 2)
+    robot = Taking()
+    for number in (1, 2, 5, 6):
+        robot.odometry(100.0 + number, number=number)
+    assert robot.intake.odometry_lost == 2 + 2
+
+
 def test_too_many_waiting_messages_behind_others_are_rejected(monkeypatch: pytest.MonkeyPatch) -> None:
     robot = Taking(at_once=1)
     robot.intake.begin()
