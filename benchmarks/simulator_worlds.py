@@ -1,13 +1,14 @@
 """Places like the worlds of well-known robot simulators, most of them without walls at right angles, for trajectories.
 
-The step for the scale was developed on the cave and the arena with seeds 0 and 1. Each function returns a world and the
-corners of a path through it, in metres.
+And corridors that bend. The step for the scale was developed on the cave and the arena with seeds 0 and 1. Each
+function returns a world and the corners of a path through it, in metres.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
+from functools import partial
 
 import numpy as np
 from scipy import ndimage
@@ -133,5 +134,29 @@ def warehouse() -> Place:
     way += [(1.5, 13.5), (14.5, 13.5), (14.5, 1.2), (1.5, 1.2), (1.5, 4.5)]
     return world_of('warehouse', walls, way[0]), np.array(way)
 
+
+def bent_corridor(radius: float) -> Place:
+    """Return a corridor of 34 m that bends to the left all along, with niches and cupboards; there and back."""
+    length, half, pieces = 34.0, 1.1, 12
+
+    def at(along: float, aside: float) -> Point:
+        """Return the place at this distance along the middle line, and to the left of it."""
+        angle = along / radius
+        return (radius - aside) * math.sin(angle), radius - (radius - aside) * math.cos(angle)
+
+    walls = [line(at(end, -half), at(end, half)) for end in (0.0, length)]
+    for side in (-half, half):
+        for k in range(pieces):
+            begin, end = length * k / pieces, length * (k + 1) / pieces
+            inner = side + math.copysign(0.3 if (k + (side > 0)) % 3 else -0.3, side)
+            straight = [at(along, side) for along in np.arange(begin, end - 1.0, 0.4).tolist()]
+            walls.append(line(*straight, at(end - 1.0, side), at(end - 1.0, inner), at(end, inner), at(end, side)))
+    way = [at(along, 0.0) for along in np.arange(1.5, length - 1.4, 2.0).tolist()]
+    return world_of(f'radius {radius:g} m', walls, way[0]), np.array(way + way[-2::-1])
+
+
+BENT: dict[str, Callable[[], Place]] = {
+    f'radius {radius:g} m': partial(bent_corridor, radius) for radius in (30.0, 50.0, 80.0, 120.0, 1e6)
+}
 
 PLACES: dict[str, Callable[[], Place]] = {f.__name__: f for f in (hexagon, house, arena, cave, warehouse)}

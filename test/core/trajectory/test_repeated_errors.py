@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from types import SimpleNamespace
 from typing import Any
@@ -9,7 +10,11 @@ from typing import Any
 import numpy as np
 import pytest
 
+from forward_grid_mapper.core.common.parameters import Parameters
 from forward_grid_mapper.core.common.readings import Floats
+from forward_grid_mapper.core.trajectory import right_angles
+from forward_grid_mapper.core.trajectory.poses import rms_after_alignment
+from forward_grid_mapper.core.trajectory.refinement import Refiner
 from forward_grid_mapper.core.trajectory.repeated_errors import (
     FEWEST_STRETCHES,
     LEAST_BEND,
@@ -19,6 +24,10 @@ from forward_grid_mapper.core.trajectory.repeated_errors import (
     are_walls_bent,
     repeated_errors,
 )
+from forward_grid_mapper.simulation.drift import LEVELS, odometry_of, with_drift
+from forward_grid_mapper.simulation.drive import drive
+from forward_grid_mapper.simulation.sonar import NOISY, sonar_ring
+from forward_grid_mapper.simulation.world import Floorplan, World
 
 STEP = 0.4
 
@@ -122,3 +131,50 @@ def test_small_bends_do_not_count() -> None:
     nodes, x = out_and_back(36.0)
     for factor, bent in ((0.9, False), (1.2, True)):
         assert are_walls_bent(windows_with(nodes[:, 2] + factor * LEAST_MEAN_BEND * x), nodes) == bent
+
+
+RADIUS, LENGTH, HALF = 70.0, 34.0, 1.1
+"""Metres: the radius of a corridor that bends to the left, its length, and half of its width."""
+
+
+def in_corridor(along: float, aside: float) -> Floats:
+    """The place at this distance along the middle line, and to the left of it."""
+    angle = along / RADIUS
+    return 3.0 + np.array([(RADIUS - aside) * math.sin(angle), RADIUS - (RADIUS - aside) * math.cos(angle)])
+
+
+def bent_corridor() -> tuple[World, Floats]:
+    """The corridor with niches and cupboards, and the corners of a path there and back."""
+    plan, pieces = Floorplan('bent', 420, 240), 12
+
+    def line(*places: Floats) -> None:
+        cells = [tuple(np.floor(10 * place).astype(int).tolist()) for place in places]
+        for start, end in itertools.pairwise(cells):
+            plan.line(start, end)
+
+    for side in (-HALF, HALF):
+        for k in range(pieces):
+            begin, end = LENGTH * k / pieces, LENGTH * (k + 1) / pieces
+            inner = side + math.copysign(0.3 if (k + (side > 0)) % 3 else -0.3, side)
+            curve = [(along, side) for along in np.arange(begin, end - 1.0, 0.4)]
+            corners = [(end - 1.0, side), (end - 1.0, inner), (end, inner), (end, side)]
+            line(*(in_corridor(*place) for place in curve + corners))
+    for end in (0.0, LENGTH):
+        line(in_corridor(end, -HALF - 0.4), in_corridor(end, HALF + 0.4))
+    out = [in_corridor(along, 0.0) for along in np.arange(1.5, LENGTH - 1.4, 2.0)]
+    return plan.world(tuple(np.floor(10 * out[0]).astype(int).tolist())), np.array([*out, *out[-2::-1]])
+
+
+@pytest.mark.slow
+def test_bent_corridor_is_not_straightened(monkeypatch: pytest.MonkeyPatch) -> None:
+    exact = drive(*bent_corridor(), 0.12, sonar_ring(16), NOISY, seed=3)
+    recording = with_drift(exact, LEVELS['low'], 2)
+    true, odometry = odometry_of(exact).pose, odometry_of(recording)
+    before = rms_after_alignment(odometry.pose, true)
+    found = Refiner(Parameters()).run(recording.readings, odometry)
+    assert found.accepted and not found.right_angles
+    assert rms_after_alignment(found.trajectory.pose, true) < 0.7 * before
+    monkeypatch.setattr(right_angles, 'are_walls_bent', lambda *rest: False)
+    straight = Refiner(Parameters()).run(recording.readings, odometry)
+    assert straight.right_angles
+    assert rms_after_alignment(straight.trajectory.pose, true) > before, 'otherwise this drive shows nothing'
