@@ -326,7 +326,7 @@ def _at_revisits(drive: Drive, walls: _AlongWalls, best: _Candidate, watch: Prog
         words, proven = f'where the robot came back, {words}', better.sigmas >= LEAST_SIGMAS
         nearby = gain_within_visits(drive.scans, drive.windows.node, best.nodes, watch)
         if is_worse_nearby(nearby, better):
-            return _Verdict(False, better, f'{words}, but not within a few metres')
+            return _Verdict(False, better, f'{words}; within a few metres, they are predicted clearly worse')
         if not proven and _is_proven_nearby(nearby, better):
             return _nearby(nearby)
         if proven or not (walls.votes_suffice and _is_recognised(drive.scans, best)):

@@ -407,7 +407,7 @@ def test_trajectory_is_judged_on_maps_of_all_visits_and_nearby(
     found = Refiner(Parameters()).run(*bent)
     assert found.accepted == accepted
     assert found.reason.startswith(reason)
-    assert ('but not within a few metres' in found.reason) == (nearby < -2.0 and not accepted)
+    assert ('within a few metres, they are predicted clearly worse' in found.reason) == (nearby < -2.0 and not accepted)
 
 
 @pytest.mark.parametrize(('gain', 'accepted'), [(-0.2, True), (-0.3, False)])
