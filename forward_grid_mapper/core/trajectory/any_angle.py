@@ -78,7 +78,6 @@ def match_drive(
     noise: float = 0.0,
     known: Floats | None = None,
     start: Floats | None = None,
-    insist: bool = False,
 ) -> MatchedDrive | None:
     """Return the trajectory of a drive from matching alone; None if its J is not larger than that of odometry.
 
@@ -98,8 +97,6 @@ def match_drive(
         Nodes of the trajectory from walls.
     start : float64, shape (K, 3), optional
         Nodes from which matching starts if it recognises few places from those of scan matching.
-    insist : bool
-        Whether to go on if scan matching does not predict readings better than the trajectory from walls.
     """
     best, value = None, scans.objective(scans.windows.node)
     if known is not None:
@@ -117,7 +114,7 @@ def match_drive(
         if make is starts[-1] and best is None:
             break
         nodes = make()
-        if not (known is None or insist or _is_worth_a_trial(scans, known, nodes, start_stage)):
+        if known is not None and gain_over_drive(scans, known, nodes, start_stage('judgement')).sigmas < WORTH_A_TRIAL:
             break
         found = _match_repeatedly(odometry, scans, start_stage, nodes, remaining, value)
         if found is not None:
@@ -134,10 +131,6 @@ def match_drive(
         if found is not None and scans.objective(found.nodes) > value:
             best, value = found, scans.objective(found.nodes)
     return best
-
-
-def _is_worth_a_trial(scans: Scans, known: Floats, nodes: Floats, start_stage: Callable[[str], Progress]) -> bool:
-    return gain_over_drive(scans, known, nodes, start_stage('judgement')).sigmas >= WORTH_A_TRIAL
 
 
 def _match_repeatedly(

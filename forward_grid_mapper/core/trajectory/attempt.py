@@ -55,8 +55,6 @@ class Attempt(NamedTuple):
         The trajectory that was refused after matching, because it did not show that odometry is wrong.
     start : float64, shape (K, 3), or None
         Nodes of a trajectory that was refused after matching, from which other methods may start.
-    maybe_bent : bool
-        Whether the walls may be bent, so that matching alone should be tried in any case.
     """
 
     refinement: Refinement
@@ -66,7 +64,6 @@ class Attempt(NamedTuple):
     before_matching: bool = False
     unproven: Attempt | None = None
     start: Floats | None = None
-    maybe_bent: bool = False
 
 
 def refined(odometry: Odometry, windows: Windows, nodes: Floats) -> Odometry:

@@ -140,7 +140,7 @@ class Refiner:
             return _without_better(by_walls.refinement, too_sparse_words(apart))
         try:
             noise = self._parameters.association.odometry_noise
-            found = match_drive(odometry, scans, self._start_stage, noise, known, by_walls.start, by_walls.maybe_bent)
+            found = match_drive(odometry, scans, self._start_stage, noise, known, by_walls.start)
         except InputError:
             # at the cell size of matching, the map of the whole drive may be too large although the final maps are not
             found = None

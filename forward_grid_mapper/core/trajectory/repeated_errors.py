@@ -44,24 +44,11 @@ SAME_PLACE, SAME_AXIS = 1.0, math.radians(30.0)
 FEWEST_STRETCHES = 4
 """Fewest stretches that were driven twice."""
 
+LEAST_T, LEAST_MEAN_BEND = 3.5, math.radians(0.5)
+"""Least t, and least mean bend to one side, radians a metre: a radius of 115 m."""
 
-class Limits(NamedTuple):
-    """Least bends, radians a metre, and their least significance.
-
-    `mean_bend` is |c̄|, and `common_bend` √(Σ a_i b_i / n), for a metre; `sigmas` is atanh r in its standard deviations.
-    """
-
-    mean_bend: float
-    t: float
-    common_bend: float
-    sigmas: float
-
-
-PROVEN = Limits(math.radians(0.5), 3.5, math.radians(0.6), 3.0)
-"""The walls are bent: a radius of 115 m or less."""
-
-LIKELY = Limits(math.radians(0.15), 2.0, math.radians(0.3), 2.0)
-"""The walls may be bent, or the robot did not see enough of them."""
+LEAST_SIGMAS, LEAST_BEND = 3.0, math.radians(0.6)
+"""Least atanh r in its standard deviations, and least bend √(Σ a_i b_i / n), radians a metre."""
 
 
 class RepeatedErrors(NamedTuple):
@@ -104,20 +91,12 @@ class RepeatedErrors(NamedTuple):
 
 def are_walls_bent(windows: Windows, nodes: Floats) -> bool:
     """Return whether odometry seems to make the same errors at the same places along nodes of shape (K, 3)."""
-    return _is_beyond(repeated_errors(windows, nodes), PROVEN)
-
-
-def may_walls_be_bent(windows: Windows, nodes: Floats) -> bool:
-    """Return whether this is likely enough for another method to be tried."""
-    return _is_beyond(repeated_errors(windows, nodes), LIKELY)
-
-
-def _is_beyond(found: RepeatedErrors, least: Limits) -> bool:
-    """Return whether both the bend and its significance reach the limits in one of the tests."""
-    (mean_bend, t), (common_bend, sigmas) = found.mean_bend, found.common_bend
-    return (mean_bend >= least.mean_bend and t >= least.t) or (
-        common_bend >= least.common_bend and sigmas >= least.sigmas
-    )
+    found = repeated_errors(windows, nodes)
+    bend, t = found.mean_bend
+    if bend >= LEAST_MEAN_BEND and t >= LEAST_T:
+        return True
+    bend, sigmas = found.common_bend
+    return bend >= LEAST_BEND and sigmas >= LEAST_SIGMAS
 
 
 def repeated_errors(windows: Windows, nodes: Floats) -> RepeatedErrors:

@@ -32,7 +32,7 @@ from .passes import Progress
 from .pose_graph import Solution
 from .poses import rms_after_alignment
 from .relocating import LEAST_RECOGNISED, confirmed_by_places, recognised, recognised_part
-from .repeated_errors import are_walls_bent, may_walls_be_bent
+from .repeated_errors import are_walls_bent
 from .scans import Scans
 from .solving import SETTLED, Solver
 from .walls import wall_votes
@@ -375,8 +375,7 @@ def _accepted(drive: Drive, best: _Candidate, verdict: _Verdict, noise: float, l
     )
     sure = recognised_part(scans, best.nodes, best.loops) >= LEAST_RECOGNISED and turns_supported(scans, best.nodes)
     sure = sure and not (verdict.by_votes and _is_contradicted(drive, best.nodes))
-    maybe_bent = may_walls_be_bent(windows, best.nodes)
-    return Attempt(outcome, best.nodes, sure and not maybe_bent, verdict.by_votes, maybe_bent=maybe_bent)
+    return Attempt(outcome, best.nodes, sure, verdict.by_votes)
 
 
 def _is_contradicted(drive: Drive, nodes: Floats) -> bool:

@@ -246,17 +246,6 @@ def test_bent_walls_are_not_used_but_matching_may_start_from_them(bent, monkeypa
     assert len(starts) == 1 and starts[0] is not None
 
 
-@pytest.mark.parametrize('maybe', [False, True])
-def test_matching_alone_is_tried_in_any_case_if_walls_may_be_bent(bent, monkeypatch, solved_once, maybe: bool) -> None:
-    insisted = list[bool]()
-    monkeypatch.setattr(right_angles, 'may_walls_be_bent', lambda windows, nodes: maybe)
-    monkeypatch.setattr(right_angles, 'recognised_part', lambda *rest: 1.0)
-    monkeypatch.setattr(right_angles, 'turns_supported', lambda *rest: True)
-    monkeypatch.setattr(refinement, 'match_drive', lambda *rest: insisted.append(rest[6]))
-    assert Refiner(Parameters()).run(*bent).right_angles
-    assert insisted == [True] * maybe
-
-
 @pytest.mark.parametrize('worse', [False, True])
 def test_walls_alone_are_named_if_loop_closures_make_it_worse(bent, monkeypatch, solved_once, worse: bool) -> None:
     def last_not_worse(scans: Scans, simple: Floats, along: Floats, matched: Floats) -> Floats:

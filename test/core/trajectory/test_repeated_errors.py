@@ -17,12 +17,11 @@ from forward_grid_mapper.core.trajectory.poses import rms_after_alignment
 from forward_grid_mapper.core.trajectory.refinement import Refiner
 from forward_grid_mapper.core.trajectory.repeated_errors import (
     FEWEST_STRETCHES,
-    LIKELY,
-    PROVEN,
+    LEAST_BEND,
+    LEAST_MEAN_BEND,
     STRETCH,
     RepeatedErrors,
     are_walls_bent,
-    may_walls_be_bent,
     repeated_errors,
 )
 from forward_grid_mapper.simulation.drift import LEVELS, odometry_of, with_drift
@@ -63,7 +62,7 @@ def test_corridor_that_bends_to_both_sides_is_detected() -> None:
     noise = np.random.default_rng(3).normal(0.0, math.radians(0.7 * math.sqrt(STEP)), len(x)).cumsum()
     windows = windows_with(nodes[:, 2] + 0.24 * np.sin(x / 8.0) + noise)
     found = repeated_errors(windows, nodes)
-    assert found.mean_bend[0] < PROVEN.mean_bend and found.common_bend[0] > PROVEN.common_bend
+    assert found.mean_bend[0] < LEAST_MEAN_BEND and found.common_bend[0] > LEAST_BEND
     assert are_walls_bent(windows, nodes)
 
 
@@ -76,25 +75,6 @@ def test_independent_errors_are_hardly_ever_taken_for_bent_walls(noise: float, r
         drift = rng.normal(0.0, math.radians(noise * math.sqrt(STEP)), len(x)).cumsum()
         found += are_walls_bent(windows_with(nodes[:, 2] + drift), nodes)
     assert found <= 6
-
-
-@pytest.mark.parametrize(
-    ('mean', 'common'),
-    [((1.0, 1.0), (0.0, 0.0)), ((0.0, 0.0), (1.0, 1.0)), ((0.9, 9.0), (9.0, 0.9)), ((9.0, 0.9), (0.9, 9.0))],
-)
-def test_one_test_suffices_if_bend_and_significance_reach_its_limits(
-    monkeypatch: pytest.MonkeyPatch, mean: tuple[float, float], common: tuple[float, float]
-) -> None:
-    """Values are in units of the limits."""
-    nodes, _ = out_and_back(36.0)
-    windows = windows_with(nodes[:, 2])
-    for limits, judge in ((PROVEN, are_walls_bent), (LIKELY, may_walls_be_bent)):
-        values = (mean[0] * limits.mean_bend, mean[1] * limits.t)
-        monkeypatch.setattr(RepeatedErrors, 'mean_bend', values)
-        values = (common[0] * limits.common_bend, common[1] * limits.sigmas)
-        monkeypatch.setattr(RepeatedErrors, 'common_bend', values)
-        assert judge(windows, nodes) == (1.0 in mean + common)
-    assert all(likely < proven for likely, proven in zip(LIKELY, PROVEN, strict=True))
 
 
 def test_gains_are_those_of_the_formulas() -> None:
@@ -150,7 +130,7 @@ def test_small_bends_do_not_count() -> None:
     """Walls that are not quite parallel repeat themselves exactly, too."""
     nodes, x = out_and_back(36.0)
     for factor, bent in ((0.9, False), (1.2, True)):
-        assert are_walls_bent(windows_with(nodes[:, 2] + factor * PROVEN.mean_bend * x), nodes) == bent
+        assert are_walls_bent(windows_with(nodes[:, 2] + factor * LEAST_MEAN_BEND * x), nodes) == bent
 
 
 RADIUS, LENGTH, HALF = 70.0, 34.0, 1.1
