@@ -160,8 +160,6 @@ class Refiner:
         if not confirmed_by_places(scans, nodes, found.loops) and within.sigmas < LEAST_SIGMAS:
             return _without_better(by_walls.refinement, unconfirmed_words(found.part))
         if is_worse_nearby(within, better):
-            if by_walls.before_matching and (walls := self._by_walls_judged(drive, least)) is not None:
-                return walls
             return _without_better(by_walls.refinement, WORSE_NEARBY)
         if known is None and (walls := self._by_walls_after_all(drive, by_walls, found, least)) is not None:
             return walls
@@ -210,15 +208,6 @@ class Refiner:
                 return None
         found = by_walls.refinement
         return replace(found, reason=found.reason + SHOWN_BY_MATCHING)
-
-    def _by_walls_judged(self, drive: Drive, least: Differences) -> Refinement | None:
-        """Return the trajectory with walls at right angles, judged as usual; None if odometry is kept.
-
-        Nothing showed this before matching, so the drive was not matched along walls.
-        """
-        noise = self._parameters.association.odometry_noise
-        found = at_right_angles(drive, noise, least, self._start_stage, match_anyway=True).refinement
-        return found if found.accepted else None
 
     def _unless_unsupported(self, drive: Drive, by_walls: Attempt, noise: float) -> Refinement:
         """Return a trajectory that only doubtful walls support, or odometry if nothing else supports it as well.

@@ -43,6 +43,10 @@ LEAST_VOTE_GAIN, LEAST_SIGMAS_WITH_WALLS = 10.0, -1.0
 the robot came back to no place, the gain in predicting readings need only be this many standard errors: readings must
 not be predicted worse. Small drift hardly shows within a few metres."""
 
+WORTH_MATCHING = 1.0
+"""Standard errors by which readings must be predicted better along straight walls, where the robot came back, for a
+drive to be matched although nothing else shows that odometry is wrong."""
+
 ROUNDS = 3
 """Most times that the drive is matched again if readings do not show that odometry is wrong."""
 
@@ -141,7 +145,6 @@ def at_right_angles(
     least: Differences,
     start_stage: Callable[[str], Progress],
     odometry_is_wrong: bool = False,
-    match_anyway: bool = False,
 ) -> Attempt:
     """Return the trajectory with walls at right angles to each other, or why there is none.
 
@@ -156,8 +159,6 @@ def at_right_angles(
         Receives the name of a stage, and returns the callable that receives its progress.
     odometry_is_wrong : bool
         Whether this is known, so that the trajectory need not show it.
-    match_anyway : bool
-        Whether the drive is matched, and then judged, even if nothing shows before that odometry is wrong.
     """
     found_heading, vote_gain = heading_of_walls(
         drive.windows, drive.scans, odometry_noise, start_stage('directions of walls')
@@ -167,10 +168,10 @@ def at_right_angles(
     solver_of = partial(_solver_of, drive, start_stage)
     walls = _along_walls(drive, found_heading, vote_gain, solver_of(found_heading), start_stage)
     # matching takes most of the time, and is left out if nothing supports its result
-    if not (walls.proven or walls.votes_suffice or odometry_is_wrong or match_anyway):
+    if not (walls.proven or walls.votes_suffice or odometry_is_wrong):
         if walls.heading.certainty < LEAST_CERTAINTY:
             return _heading_lost(drive, walls.heading.certainty)
-        if walls.vote_gain <= LEAST_VOTE_GAIN:
+        if walls.vote_gain <= LEAST_VOTE_GAIN and not _may_be_proven_at_revisits(drive, walls, start_stage):
             return _unproven(drive, walls, walls.verdict)._replace(before_matching=True)
     found = solve_hypotheses(drive.scans, walls.heading, walls.solver, walls.along, solver_of)
     if found.certainty < LEAST_CERTAINTY:
@@ -241,6 +242,17 @@ def _along_walls(
     simple = solver.simple(calibration)
     better = gain_over_drive(drive.scans, drive.windows.node, simple, start_stage('judgement'))
     return _AlongWalls(heading, vote_gain, solver, along, _by_name(calibration), simple, better)
+
+
+def _may_be_proven_at_revisits(drive: Drive, walls: _AlongWalls, start_stage: Callable[[str], Progress]) -> bool:
+    """Return whether straight walls alone predict readings better where the robot came back along them.
+
+    Wheels that are good over metres are off by more after a whole drive, and only revisits show it.
+    """
+    scans, nodes = drive.scans, walls.along.nodes
+    if not has_revisits(scans, nodes):
+        return False
+    return gain_at_revisits(scans, drive.windows.node, nodes, start_stage('judgement')).sigmas >= WORTH_MATCHING
 
 
 def _matched_further(scans: Scans, found: Solved) -> Solved:

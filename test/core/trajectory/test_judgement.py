@@ -15,11 +15,10 @@ from forward_grid_mapper.core.common.parameters import Parameters
 from forward_grid_mapper.core.common.readings import Floats, Readings
 from forward_grid_mapper.core.trajectory import holding_out, refinement, right_angles
 from forward_grid_mapper.core.trajectory.any_angle import MatchedDrive
-from forward_grid_mapper.core.trajectory.attempt import ACCURACY, Attempt, Drive, gain_words
+from forward_grid_mapper.core.trajectory.attempt import Attempt, Drive, gain_words
 from forward_grid_mapper.core.trajectory.heading import Drifts, Heading
 from forward_grid_mapper.core.trajectory.holding_out import EVERY, Gain, gain, held_out
 from forward_grid_mapper.core.trajectory.hypotheses import Solved
-from forward_grid_mapper.core.trajectory.local_map import for_matching
 from forward_grid_mapper.core.trajectory.outcome import Refinement
 from forward_grid_mapper.core.trajectory.pose_graph import Solution, solution_at
 from forward_grid_mapper.core.trajectory.poses import rms_after_alignment
@@ -190,50 +189,28 @@ def test_matching_is_compared_with_odometry_within_a_few_metres(
     assert accepted or expected in found.reason
 
 
-@pytest.mark.parametrize(('before_matching', 'accepted'), [(True, True), (True, False), (False, True)])
-def test_walls_are_matched_and_judged_if_matching_alone_is_worse_nearby(
-    bent, monkeypatch, before_matching: bool, accepted: bool
+@pytest.mark.parametrize(
+    ('comes_back', 'gain', 'matched'), [(True, 1.1, True), (True, 0.9, False), (False, 1.1, False)]
+)
+def test_drive_is_matched_if_straight_walls_may_be_proven_where_it_came_back(
+    bent, monkeypatch, solved_once, comes_back: bool, gain: float, matched: bool
 ) -> None:
-    """Matching alone shows that odometry contradicts itself; walls were refused before anything was matched."""
-    (readings, odometry), asked = bent, list[dict[str, bool]]()
-
-    def at_right_angles(drive: Drive, *rest, **options: bool) -> Attempt:
-        asked.append(options)
-        outcome = Refinement(accepted and bool(options), 'walls', readings, odometry, {})
-        return Attempt(outcome, drive.windows.node, before_matching=before_matching)
-
-    def matched(odometry: Odometry, scans: Scans, *rest) -> MatchedDrive:
-        return MatchedDrive(scans.windows.node * (1.1, 1.0, 1.0), [], 0.0, 1.0, scans)
-
-    monkeypatch.setattr(refinement, 'at_right_angles', at_right_angles)
-    monkeypatch.setattr(refinement, 'match_drive', matched)
-    monkeypatch.setattr(refinement, 'confirmed_by_places', lambda *rest: True)
-    monkeypatch.setattr(refinement, 'gain_within_visits', lambda *rest: Gain(-0.3, 0.1))
-    monkeypatch.setattr(refinement, 'gain_at_revisits', lambda *rest: Gain(0.8, 0.1))
-    found = Refiner(Parameters()).run(readings, odometry)
-    # by the usual judgement: it is not known that odometry is wrong
-    assert asked == [{}, {'match_anyway': True}][: 1 + before_matching]
-    assert found.accepted == (before_matching and accepted)
-    assert found.accepted or found.reason.endswith(refinement.WORSE_NEARBY)
-
-
-def test_drive_is_matched_before_anything_shows_that_odometry_is_wrong_if_asked(bent, monkeypatch, solved_once) -> None:
-    monkeypatch.setattr(right_angles, 'gain_over_drive', lambda *rest: Gain(-0.05, 0.01))
-    monkeypatch.setattr(right_angles, 'LEAST_VOTE_GAIN', 1e9)
+    """Neither nearby readings nor votes show that odometry is wrong."""
     judged = list[bool]()
 
     def at_revisits(*rest) -> right_angles._Verdict:
         judged.append(True)
         return right_angles._Verdict(True, Gain(0.03, 0.01), 'judged')
 
+    monkeypatch.setattr(right_angles, 'gain_over_drive', lambda *rest: Gain(-0.05, 0.01))
+    monkeypatch.setattr(right_angles, 'LEAST_VOTE_GAIN', 1e9)
+    monkeypatch.setattr(right_angles, 'gain_at_revisits', lambda *rest: Gain(0.01 * gain, 0.01))
     monkeypatch.setattr(right_angles, '_at_revisits', at_revisits)
-    readings, odometry = bent
-    windows = cut(readings, odometry)
-    scans = Scans(windows, for_matching(Parameters()), np.zeros(1, np.uint8), held_out(len(windows)))
-    known = Drive(readings, odometry, windows, scans), 0.0, ACCURACY, lambda stage: lambda part: None
-    assert right_angles.at_right_angles(*known).before_matching and not judged
-    found = right_angles.at_right_angles(*known, match_anyway=True)
-    assert found.refinement.accepted and found.refinement.reason.startswith('judged') and judged
+    monkeypatch.setattr(refinement, 'match_drive', no_matches)
+    let_come_back(monkeypatch, lambda *rest: comes_back)
+    found = Refiner(Parameters()).run(*bent)
+    assert found.accepted == matched == bool(judged)
+    assert found.reason.startswith('judged' if matched else 'readings are predicted worse')
 
 
 def test_bent_walls_are_not_used_but_matching_may_start_from_them(bent, monkeypatch, solved_once) -> None:
