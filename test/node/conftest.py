@@ -16,8 +16,9 @@ from forward_grid_mapper.node.background import NICE
 
 sys.path.insert(0, str(Path(__file__).parent))
 
-# workers of nodes get hardly any time while the tests that wait for them have more priority
-os.nice(max(NICE - os.nice(0), 0))
+# for all tests of this process, since workers of nodes get hardly any time while tests that wait have more priority
+if hasattr(os, 'nice'):
+    os.nice(max(NICE - os.nice(0), 0))
 
 
 @pytest.fixture

@@ -23,6 +23,8 @@ Over 4 m, a turn of 2° moves walls by as much."""
 SMALLEST_GAIN = 0.0005
 """Smallest gain that is called better or worse if it is not significant, nats a reading; it has three decimals."""
 
+UNMATCHED = '; it comes from walls alone, without loop closures: with these, readings are predicted worse'
+
 
 class Drive(NamedTuple):
     """A drive, its windows and their scans."""
@@ -55,6 +57,8 @@ class Attempt(NamedTuple):
         The trajectory that was refused after matching, because it did not show that odometry is wrong.
     start : float64, shape (K, 3), or None
         Nodes of a trajectory that was refused after matching, from which other methods may start.
+    matched : bool
+        Whether matches and loop closures were used; otherwise readings were predicted worse with them.
     """
 
     refinement: Refinement
@@ -64,6 +68,7 @@ class Attempt(NamedTuple):
     before_matching: bool = False
     unproven: Attempt | None = None
     start: Floats | None = None
+    matched: bool = True
 
 
 def refined(odometry: Odometry, windows: Windows, nodes: Floats) -> Odometry:

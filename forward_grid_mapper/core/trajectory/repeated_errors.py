@@ -1,22 +1,24 @@
 """Bent walls that were taken for straight ones: odometry then seems to make the same error at the same place.
 
 Wheels do not know where they are. So along the right trajectory, the errors of the yaw of odometry in two visits of a
-place are independent, once the mean error is subtracted. If a bent corridor was taken for a straight one, odometry
-seems to turn by the same angle in the same place again: to the left on the way out, to the right on the way back. Let
-n stretches be driven twice, with the errors a_i and b_i; those of a visit from the other side are turned around. There
-are two tests.
+place are independent, once the constant errors of a metre and of a turn are subtracted. If a bent corridor was taken
+for a straight one, odometry seems to turn by the same angle in the same place again: to the left on the way out, to the
+right on the way back. Let n stretches be driven twice, with the errors a_i and b_i, radians a metre; those of a visit
+from the other side are turned around. There are two tests.
 
-A corridor may bend all along to one side. For stretches that were driven in both directions, with c_i = (a_i + b_i) / 2
-and d_i = (a_i − b_i) / 2, which have the same variance if the errors are independent,
+A corridor may bend all along to one side. For the n stretches that were driven in both directions, with
+c_i = (a_i + b_i) / 2 and d_i = (a_i − b_i) / 2, which have the same variance if the errors are independent,
 
     t = c̄ / √(s² / n)        s² = (Σ (c_i − c̄)² + Σ d_i²) / (2n − 1)
 
-A constant error of the wheels has no part in c̄. In general,
+A constant error of the wheels has no part in c̄. For all n stretches,
 
     r = Σ a_i b_i / √(Σ a_i² Σ b_i²)        atanh r ~ N(0, 1 / (n − 2))
 
 if they are independent (Fisher's transformation, for variables of mean 0). Small errors repeat themselves as well, as
 where walls are not quite parallel, so there is a smallest bend in both tests.
+
+Other errors repeat themselves, too: those of a compass, or of wheels on a floor that slopes to one side.
 """
 
 from __future__ import annotations
@@ -52,7 +54,9 @@ LEAST_SIGMAS, LEAST_BEND = 3.0, math.radians(0.6)
 
 
 class RepeatedErrors(NamedTuple):
-    """Errors of the yaw of odometry in n stretches that were driven twice, radians, without the mean error.
+    """Errors of the yaw of odometry in n stretches that were driven twice, radians a metre.
+
+    Without the errors that are constant for a metre and for a turn.
 
     Attributes
     ----------
@@ -76,7 +80,7 @@ class RepeatedErrors(NamedTuple):
         both, half = (a + b) / 2, (a - b) / 2
         mean = float(both.mean())
         error = math.sqrt((((both - mean) ** 2).sum() + (half**2).sum()) / (2 * n - 1) / n)
-        return abs(mean) / STRETCH, abs(mean) / max(error, 1e-9)
+        return abs(mean), abs(mean) / max(error, 1e-9)
 
     @property
     def common_bend(self) -> tuple[float, float]:
@@ -86,7 +90,7 @@ class RepeatedErrors(NamedTuple):
         if n < FEWEST_STRETCHES or together <= 0.0:
             return 0.0, 0.0
         r = together / math.sqrt(float((self.later**2).sum() * (self.earlier**2).sum()))
-        return math.sqrt(together / n) / STRETCH, math.atanh(min(r, 0.999)) * math.sqrt(n - 2)
+        return math.sqrt(together / n), math.atanh(min(r, 0.999)) * math.sqrt(n - 2)
 
 
 def are_walls_bent(windows: Windows, nodes: Floats) -> bool:
@@ -103,23 +107,17 @@ def repeated_errors(windows: Windows, nodes: Floats) -> RepeatedErrors:
     """Return the errors in stretches that were driven twice; no two of them overlap."""
     travel = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(nodes[:, :2], axis=0).T))])
     yaw = np.unwrap(nodes[:, 2])
-    begin, end = (np.searchsorted(travel, travel + side * STRETCH / 2) for side in (-1.0, 1.0))
-    usable = end < len(nodes)
-    usable &= travel >= STRETCH / 2
-    for k in np.flatnonzero(usable).tolist():
-        usable[k] = np.ptp(yaw[begin[k] : end[k] + 1]) <= MOST_TURN
-    off = np.unwrap(windows.node[:, 2] - nodes[:, 2])
-    error = np.zeros(len(nodes))
-    error[usable] = off[end[usable]] - off[begin[usable]]
-    if usable.any():
-        error -= error[usable].mean()
+    error, usable = _errors(windows, travel, yaw)
     found, left = list[tuple[float, float, bool]](), usable.copy()
     for k in np.flatnonzero(usable).tolist():
-        distance = np.hypot(*(nodes[:, :2] - nodes[k, :2]).T)
-        angle = np.abs(wrapped(yaw - yaw[k]))
-        same = left & (travel < travel[k] - REVISIT_AFTER) & (distance < SAME_PLACE)
-        same &= np.minimum(angle, math.pi - angle) < SAME_AXIS
-        if not left[k] or not same.any():
+        if not left[k]:
+            continue
+        # travel increases, so earlier nodes are the first ones
+        before = int(np.searchsorted(travel, travel[k] - REVISIT_AFTER))
+        distance = np.hypot(*(nodes[:before, :2] - nodes[k, :2]).T)
+        angle = np.abs(wrapped(yaw[:before] - yaw[k]))
+        same = left[:before] & (distance < SAME_PLACE) & (np.minimum(angle, math.pi - angle) < SAME_AXIS)
+        if not same.any():
             continue
         other = int(np.argmin(np.where(same, distance, np.inf)))
         opposite = bool(angle[other] > math.pi / 2)
@@ -128,3 +126,18 @@ def repeated_errors(windows: Windows, nodes: Floats) -> RepeatedErrors:
             left &= np.abs(travel - travel[used]) >= STRETCH
     table = np.array(found, np.float64).reshape(-1, 3)
     return RepeatedErrors(table[:, 0], table[:, 1], table[:, 2] > 0.0)
+
+
+def _errors(windows: Windows, travel: Floats, yaw: Floats) -> tuple[Floats, NDArray[np.bool_]]:
+    """Return the error in the stretch around each node, radians a metre, and whether that stretch is used."""
+    begin, end = (np.searchsorted(travel, travel + side * STRETCH / 2) for side in (-1.0, 1.0))
+    usable = (travel >= STRETCH / 2) & (end < len(travel))
+    for k in np.flatnonzero(usable).tolist():
+        usable[k] = np.ptp(yaw[begin[k] : end[k] + 1]) <= MOST_TURN
+    error, first, last = np.zeros(len(travel)), begin[usable], end[usable]
+    length = travel[last] - travel[first]
+    off = np.unwrap(windows.node[:, 2] - yaw)
+    mean, turned = (off[last] - off[first]) / length, (yaw[last] - yaw[first]) / length
+    constant = np.stack([np.ones(len(mean)), turned], axis=1)
+    error[usable] = mean - constant @ np.linalg.lstsq(constant, mean, rcond=None)[0]
+    return error, usable

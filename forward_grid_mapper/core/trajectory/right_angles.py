@@ -11,7 +11,7 @@ import numpy as np
 
 from ..common.errors import InputError
 from ..common.readings import Floats
-from .attempt import ACCURACY, EXACT, Attempt, Drive, gain_words, refined
+from .attempt import ACCURACY, EXACT, UNMATCHED, Attempt, Drive, gain_words, refined
 from .folds import accepted_in_folds
 from .heading import NOISES, Heading, heading
 from .holding_out import LEAST_SIGMAS, Gain, has_revisits, tears_apart
@@ -63,11 +63,10 @@ NO_WALLS = (
     'and odometry with an accurate yaw over a few metres'
 )
 
-UNMATCHED = '; it comes from walls alone, without loop closures: with these, readings are predicted worse'
 
 BENT = (
     'walls at right angles do not fit: along them, odometry would make the same error whenever the robot comes to the '
-    'same place, so the walls there are bent, or at other angles'
+    'same place, so the walls there are probably bent, or at other angles'
 )
 
 
@@ -184,7 +183,8 @@ def at_right_angles(
     if unproven and (further := _matched_further(drive.scans, found)) is not found:
         best, verdict = _judged(drive, walls, further, watch)
         attempt = _accepted(drive, best, verdict, walls.heading.drifts.noise, least)
-    if verdict.accepted or odometry_is_wrong:
+    # bent walls are refused whatever the readings say, and matching may start from them
+    if verdict.accepted or odometry_is_wrong or attempt.start is not None:
         return attempt
     if not attempt.refinement.accepted:
         return _unproven(drive, walls, verdict)
@@ -387,7 +387,7 @@ def _accepted(drive: Drive, best: _Candidate, verdict: _Verdict, noise: float, l
     )
     sure = recognised_part(scans, best.nodes, best.loops) >= LEAST_RECOGNISED and turns_supported(scans, best.nodes)
     sure = sure and not (verdict.by_votes and _is_contradicted(drive, best.nodes))
-    return Attempt(outcome, best.nodes, sure, verdict.by_votes)
+    return Attempt(outcome, best.nodes, sure, verdict.by_votes, matched=best.matched)
 
 
 def _is_contradicted(drive: Drive, nodes: Floats) -> bool:

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from forward_grid_mapper.core.common.errors import InputError
 from forward_grid_mapper.core.common.readings import Floats
 from forward_grid_mapper.core.trajectory import folds, holding_out
-from forward_grid_mapper.core.trajectory.attempt import Attempt, Drive
+from forward_grid_mapper.core.trajectory.attempt import UNMATCHED, Attempt, Drive
 from forward_grid_mapper.core.trajectory.folds import NEARLY, OTHERS, accepted_in_folds
 from forward_grid_mapper.core.trajectory.holding_out import EVERY, LEAST_SIGMAS, held_out
 from forward_grid_mapper.core.trajectory.outcome import Refinement
@@ -96,6 +96,15 @@ def test_folds_are_added_while_they_may_show_that_odometry_is_wrong(
         reason = f'with other windows held out in each of {1 + solved} trials, readings are predicted better'
         assert found.refinement.reason.startswith(reason)
         assert found.refinement.gain > 0.0
+
+
+@pytest.mark.parametrize('matched', [True, False])
+def test_walls_alone_are_named_by_the_folds_as_well(scans, monkeypatch, matched: bool) -> None:
+    trial = Folds(monkeypatch, scans, [ENOUGH, ENOUGH])
+    attempt = trial.attempt
+    monkeypatch.setattr(trial, 'attempt', lambda number: attempt(number)._replace(matched=matched))
+    found = trial.judged()
+    assert found is not None and found.refinement.reason.endswith(UNMATCHED) != matched
 
 
 def test_first_fold_is_taken_if_the_map_of_the_whole_drive_is_too_large(scans, monkeypatch) -> None:

@@ -15,7 +15,7 @@ from forward_grid_mapper.core.common.parameters import Parameters
 from forward_grid_mapper.core.common.readings import Floats, Readings
 from forward_grid_mapper.core.trajectory import holding_out, refinement, right_angles
 from forward_grid_mapper.core.trajectory.any_angle import MatchedDrive
-from forward_grid_mapper.core.trajectory.attempt import Attempt, Drive, gain_words
+from forward_grid_mapper.core.trajectory.attempt import UNMATCHED, Attempt, Drive, gain_words
 from forward_grid_mapper.core.trajectory.heading import Drifts, Heading
 from forward_grid_mapper.core.trajectory.holding_out import EVERY, Gain, gain, held_out
 from forward_grid_mapper.core.trajectory.hypotheses import Solved
@@ -25,7 +25,7 @@ from forward_grid_mapper.core.trajectory.poses import rms_after_alignment
 from forward_grid_mapper.core.trajectory.refinement import Refiner
 from forward_grid_mapper.core.trajectory.scans import Scans
 from forward_grid_mapper.core.trajectory.solving import Solver
-from forward_grid_mapper.core.trajectory.windows import Odometry, cut
+from forward_grid_mapper.core.trajectory.windows import Odometry, Windows, cut
 from forward_grid_mapper.simulation.drift import odometry_of
 from forward_grid_mapper.simulation.drive import Recording
 
@@ -67,13 +67,16 @@ def results() -> dict[str, Any]:
 
 
 def remember(monkeypatch, results: dict[str, Any], name: str) -> None:
-    """Let a function of `right_angles` compute its result in the first test only."""
+    """Let a function of `right_angles` compute its result in the first test only; later ones must ask for the same."""
     compute = getattr(right_angles, name)
 
     def known(*rest) -> Any:
+        of = [each.solution.nodes if isinstance(each, Solved) else getattr(each, 'nodes', None) for each in rest]
         if name not in results:
-            results[name] = compute(*rest)
-        return results[name]
+            results[name] = compute(*rest), of
+        made, made_of = results[name]
+        assert all(np.array_equal(now, then) for now, then in zip(of, made_of, strict=True))
+        return made
 
     monkeypatch.setattr(right_angles, name, known)
 
@@ -213,26 +216,43 @@ def test_drive_is_matched_if_straight_walls_may_be_proven_where_it_came_back(
     assert found.reason.startswith('judged' if matched else 'readings are predicted worse')
 
 
-def test_bent_walls_are_not_used_but_matching_may_start_from_them(bent, monkeypatch, solved_once) -> None:
-    starts = list[Floats]()
+@pytest.mark.parametrize('proven', [True, False])
+def test_bent_walls_are_not_used_but_matching_may_start_from_them(
+    bent, monkeypatch, matched_once, proven: bool
+) -> None:
+    starts, asked = list[Floats](), list[Floats]()
+
+    def are_walls_bent(windows: Windows, nodes: Floats) -> bool:
+        asked.append(nodes)
+        return True
+
     monkeypatch.setattr(refinement, 'match_drive', lambda *rest: starts.append(rest[5]))
-    monkeypatch.setattr(right_angles, 'are_walls_bent', lambda windows, nodes: nodes is not windows.node)
+    monkeypatch.setattr(right_angles, 'are_walls_bent', are_walls_bent)
+    if not proven:
+        judged = right_angles._judged
+        refused = right_angles._Verdict(False, Gain(0.02, 0.01), 'refused')
+        monkeypatch.setattr(right_angles, '_judged', lambda *rest: (judged(*rest)[0], refused))
     found = Refiner(Parameters()).run(*bent)
     assert not found.accepted and found.trajectory is bent[1]
     assert found.reason.startswith(right_angles.BENT)
-    assert len(starts) == 1 and starts[0] is not None
+    assert found.gain == pytest.approx(0.02) if not proven else found.gain > 0.0
+    assert len(starts) == 1 and starts[0] is asked[-1]
 
 
-@pytest.mark.parametrize('worse', [False, True])
-def test_walls_alone_are_named_if_loop_closures_make_it_worse(bent, monkeypatch, solved_once, worse: bool) -> None:
-    def last_not_worse(scans: Scans, simple: Floats, along: Floats, matched: Floats) -> Floats:
-        return along if worse else matched
+def test_accuracy_of_sonar_is_asked_before_bent_walls(tour, monkeypatch) -> None:
+    monkeypatch.setattr(right_angles, 'are_walls_bent', lambda *rest: True)
+    monkeypatch.setattr(right_angles, 'gain_over_drive', lambda *rest: Gain(0.05, 0.01))
+    found = Refiner(Parameters()).run(tour.readings, odometry_of(tour))
+    assert not found.accepted and 'not more than the accuracy of sonar' in found.reason
 
-    monkeypatch.setattr(right_angles, 'last_not_worse', last_not_worse)
+
+@pytest.mark.parametrize('used', [0, 1, 2])
+def test_walls_alone_are_named_if_loop_closures_make_it_worse(bent, monkeypatch, solved_once, used: int) -> None:
+    monkeypatch.setattr(right_angles, 'last_not_worse', lambda scans, *trajectories: trajectories[used])
     monkeypatch.setattr(refinement, 'match_drive', no_matches)
     found = Refiner(Parameters()).run(*bent)
-    assert found.accepted and found.reason.endswith(right_angles.UNMATCHED) == worse
-    assert not (worse and found.loops)
+    assert found.accepted and found.reason.endswith(UNMATCHED) == (used < 2)
+    assert used == 2 or not found.loops
 
 
 def test_walls_that_tear_apart_what_matching_brings_together_are_not_taken(bent, monkeypatch) -> None:

@@ -77,41 +77,79 @@ def test_independent_errors_are_hardly_ever_taken_for_bent_walls(noise: float, r
     assert found <= 6
 
 
-def test_gains_are_those_of_the_formulas() -> None:
+def test_bends_are_those_of_the_formulas() -> None:
     rng = np.random.default_rng(1)
     a, b = rng.normal(0.05, 0.03, (2, 9))
     opposite = np.arange(9) != 4
     found = RepeatedErrors(b, a, opposite)
     c, d = ((a + b) / 2)[opposite], ((a - b) / 2)[opposite]
     s2 = (sum((each - sum(c) / 8) ** 2 for each in c) + sum(each**2 for each in d)) / 15
-    assert found.mean_bend == pytest.approx((sum(c) / 8 / STRETCH, sum(c) / 8 / math.sqrt(s2 / 8)))
+    assert found.mean_bend == pytest.approx((sum(c) / 8, sum(c) / 8 / math.sqrt(s2 / 8)))
     r = sum(a * b) / math.sqrt(sum(a**2) * sum(b**2))
-    assert found.common_bend == pytest.approx((math.sqrt(sum(a * b) / 9) / STRETCH, math.atanh(r) * math.sqrt(7)))
+    assert found.common_bend == pytest.approx((math.sqrt(sum(a * b) / 9), math.atanh(r) * math.sqrt(7)))
     few = FEWEST_STRETCHES - 1
     assert RepeatedErrors(b[:few], a[:few], opposite[:few]).mean_bend == (0.0, 0.0)
     assert RepeatedErrors(b[:few], a[:few], opposite[:few]).common_bend == (0.0, 0.0)
     assert RepeatedErrors(-b, a, opposite).common_bend == (0.0, 0.0)
 
 
-@pytest.mark.parametrize('back', [False, True])
-def test_errors_are_those_of_their_stretches(back: bool) -> None:
-    """The sign of one from the other side is turned around, and no stretch is used twice."""
+def two_ways(back: bool, aside: float = 0.0, angle: float = 0.0, turns: float = 0.0) -> Floats:
+    """Nodes along a corridor of 40 m, a detour, and the corridor again: aside, turned around its middle, or back."""
     out = np.arange(0.0, 40.0, STEP)
-    detour = 30
-    nodes = np.zeros((2 * len(out) + detour, 3))
-    # far from the corridor in between
-    nodes[:, 0] = np.concatenate([out, np.full(detour, 20.0), out[::-1] if back else out])
-    nodes[len(out) : len(out) + detour, 1] = 50.0 + STEP * np.arange(detour)
-    nodes[len(out) : len(out) + detour, 2] = math.pi / 2
-    nodes[len(out) + detour :, 2] = math.pi if back else 0.0
-    place = nodes[:, 0] / 5.0
-    found = repeated_errors(windows_with(nodes[:, 2] + 0.1 * np.sin(place)), nodes)
-    assert len(found.later) == pytest.approx(40.0 / STRETCH, abs=2.0)
+    first = np.column_stack([out, np.zeros(len(out)), np.zeros(len(out))])
+    detour = np.column_stack([np.full(30, 20.0), 50.0 + STEP * np.arange(30), np.full(30, math.pi / 2)])
+    along = (out - 20.0)[::-1] if back else out - 20.0
+    second = np.column_stack(
+        [20.0 + along * math.cos(angle), aside + along * math.sin(angle), np.full(len(out), angle)]
+    )
+    second[:, 2] += math.pi * back + 2 * math.pi * turns
+    return np.concatenate([first, detour, second])
+
+
+@pytest.mark.parametrize('back', [False, True])
+@pytest.mark.parametrize('turns', [0, -3])
+def test_errors_are_those_of_their_stretches(back: bool, turns: int) -> None:
+    """The sign of one from the other side is turned around, and no stretch is used twice."""
+    nodes = two_ways(back, turns=turns)
+    errors = 0.1 * np.sin(nodes[:, 0] / 5.0)
+    found = repeated_errors(windows_with(nodes[:, 2] + errors), nodes)
+    assert 40.0 / STRETCH - 2.0 <= len(found.later) <= 40.0 / STRETCH
     assert found.opposite.all() == back and found.opposite.any() == back
     # both in the direction of the first visit, but for the mean error, which has the direction of driving
     apart = found.later - found.earlier
-    assert apart == pytest.approx(apart.mean(), abs=0.02)
-    assert np.ptp(found.later) == pytest.approx(2 * 0.1 * 2 * math.sin(STRETCH / 10.0), rel=0.15)
+    assert apart == pytest.approx(apart.mean(), abs=0.004)
+    assert np.ptp(found.later) == pytest.approx(2 * 0.1 * 2 * math.sin(STRETCH / 10.0) / STRETCH, rel=0.15)
+    wrapped_yaw = nodes.copy()
+    wrapped_yaw[:, 2] = (nodes[:, 2] + 3.0) % (2 * math.pi)
+    again = repeated_errors(windows_with((nodes[:, 2] + errors + 0.2) % (2 * math.pi)), wrapped_yaw)
+    assert again.later == pytest.approx(found.later, abs=1e-9)
+
+
+@pytest.mark.parametrize(
+    ('aside', 'degrees', 'paired'), [(0.8, 0.0, True), (1.2, 0.0, False), (0.0, 25.0, True), (0.0, 40.0, False)]
+)
+def test_stretches_of_one_pair_are_at_the_same_place(aside: float, degrees: float, paired: bool) -> None:
+    nodes = two_ways(False, aside, math.radians(degrees))
+    found = repeated_errors(windows_with(nodes[:, 2]), nodes)
+    assert (len(found.later) > 0) == paired
+
+
+def test_stretches_are_paired_with_the_nearest_ones_and_used_once() -> None:
+    nodes = two_ways(True)
+    # the error of a metre is proportional to x, so that it tells places apart
+    found = repeated_errors(windows_with(nodes[:, 2] + 1e-3 * nodes[:, 0] ** 2 / 2.0), nodes)
+    earlier, later = np.sort(found.earlier), found.later
+    assert np.diff(earlier).min() > 0.9e-3 * STRETCH, 'no two of them overlap'
+    assert np.ptp(later - found.earlier) < 0.5e-3, 'and both of a pair are at the same place'
+
+
+def test_constant_errors_of_metres_and_turns_do_not_count() -> None:
+    nodes, x = out_and_back(36.0)
+    nodes[:, 2] += 0.15 * np.sin(x / 2.0)
+    travel = STEP * np.arange(len(x))
+    found = repeated_errors(windows_with(1.2 * nodes[:, 2] + 0.03 * travel), nodes)
+    assert len(found.later) >= FEWEST_STRETCHES
+    assert found.later == pytest.approx(0.0, abs=1e-9) and found.earlier == pytest.approx(0.0, abs=1e-9)
 
 
 def test_turns_and_single_visits_are_left_out() -> None:
