@@ -248,9 +248,12 @@ def test_accuracy_of_sonar_is_asked_before_bent_walls(tour, monkeypatch) -> None
 
 @pytest.mark.parametrize('used', [0, 1, 2])
 def test_walls_alone_are_named_if_loop_closures_make_it_worse(bent, monkeypatch, solved_once, used: int) -> None:
+    accept, attempts = right_angles._accepted, list[Attempt]()
+    monkeypatch.setattr(right_angles, '_accepted', lambda *rest: attempts.append(accept(*rest)) or attempts[-1])
     monkeypatch.setattr(right_angles, 'last_not_worse', lambda scans, *trajectories: trajectories[used])
     monkeypatch.setattr(refinement, 'match_drive', no_matches)
     found = Refiner(Parameters()).run(*bent)
+    assert [attempt.matched for attempt in attempts] == [used == 2]
     assert found.accepted and found.reason.endswith(UNMATCHED) == (used < 2)
     assert used == 2 or not found.loops
 

@@ -21,6 +21,7 @@ from forward_grid_mapper.core.trajectory.repeated_errors import (
     LEAST_MEAN_BEND,
     STRETCH,
     RepeatedErrors,
+    _errors,
     are_walls_bent,
     repeated_errors,
 )
@@ -97,7 +98,9 @@ def two_ways(back: bool, aside: float = 0.0, angle: float = 0.0, turns: float = 
     """Nodes along a corridor of 40 m, a detour, and the corridor again: aside, turned around its middle, or back."""
     out = np.arange(0.0, 40.0, STEP)
     first = np.column_stack([out, np.zeros(len(out)), np.zeros(len(out))])
-    detour = np.column_stack([np.full(30, 20.0), 50.0 + STEP * np.arange(30), np.full(30, math.pi / 2)])
+    # turning on the way, by less than half a turn from one node to the next, and by a right angle at both ends
+    yaw = np.linspace(0.0, angle + math.pi * back + 2 * math.pi * turns, 30) + math.pi / 2
+    detour = np.column_stack([np.full(30, 20.0), 50.0 + STEP * np.arange(30), yaw])
     along = (out - 20.0)[::-1] if back else out - 20.0
     second = np.column_stack(
         [20.0 + along * math.cos(angle), aside + along * math.sin(angle), np.full(len(out), angle)]
@@ -121,7 +124,7 @@ def test_errors_are_those_of_their_stretches(back: bool, turns: int) -> None:
     assert np.ptp(found.later) == pytest.approx(2 * 0.1 * 2 * math.sin(STRETCH / 10.0) / STRETCH, rel=0.15)
     wrapped_yaw = nodes.copy()
     wrapped_yaw[:, 2] = (nodes[:, 2] + 3.0) % (2 * math.pi)
-    again = repeated_errors(windows_with((nodes[:, 2] + errors + 0.2) % (2 * math.pi)), wrapped_yaw)
+    again = repeated_errors(windows_with((nodes[:, 2] + errors) % (2 * math.pi)), wrapped_yaw)
     assert again.later == pytest.approx(found.later, abs=1e-9)
 
 
@@ -136,11 +139,18 @@ def test_stretches_of_one_pair_are_at_the_same_place(aside: float, degrees: floa
 
 def test_stretches_are_paired_with_the_nearest_ones_and_used_once() -> None:
     nodes = two_ways(True)
-    # the error of a metre is proportional to x, so that it tells places apart
-    found = repeated_errors(windows_with(nodes[:, 2] + 1e-3 * nodes[:, 0] ** 2 / 2.0), nodes)
-    earlier, later = np.sort(found.earlier), found.later
-    assert np.diff(earlier).min() > 0.9e-3 * STRETCH, 'no two of them overlap'
-    assert np.ptp(later - found.earlier) < 0.5e-3, 'and both of a pair are at the same place'
+    # the error of a metre is x in metres, so that it tells places apart
+    found = repeated_errors(windows_with(nodes[:, 2] + nodes[:, 0] ** 2 / 2.0), nodes)
+    assert np.diff(np.sort(found.earlier)).min() > 0.9 * STRETCH, 'no two of them overlap'
+    # stretches are cut at nodes, half a step ahead of their middle in the direction of driving
+    assert found.later == pytest.approx(found.earlier - 2 * STEP, abs=0.9 * STEP), 'those of a pair are nearest'
+
+
+def test_stretches_are_whole() -> None:
+    nodes, _ = out_and_back(12.0)
+    travel = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(nodes[:, :2], axis=0).T))])
+    usable = _errors(windows_with(nodes[:, 2]), travel, np.zeros(len(nodes)))[1]
+    assert usable.tolist() == [STRETCH / 2 <= at <= travel[-1] - STRETCH / 2 for at in travel.tolist()]
 
 
 def test_constant_errors_of_metres_and_turns_do_not_count() -> None:
