@@ -139,11 +139,12 @@ def test_stretches_of_one_pair_are_at_the_same_place(aside: float, degrees: floa
 
 def test_stretches_are_paired_with_the_nearest_ones_and_used_once() -> None:
     nodes = two_ways(True)
-    # the error of a metre is x in metres, so that it tells places apart
-    found = repeated_errors(windows_with(nodes[:, 2] + nodes[:, 0] ** 2 / 2.0), nodes)
-    assert np.diff(np.sort(found.earlier)).min() > 0.9 * STRETCH, 'no two of them overlap'
+    # the error of a metre is x in mrad, so that it tells places apart
+    found = repeated_errors(windows_with(nodes[:, 2] + 1e-3 * nodes[:, 0] ** 2 / 2.0), nodes)
+    earlier, later = 1e3 * found.earlier, 1e3 * found.later
+    assert np.diff(np.sort(earlier)).min() > 0.9 * STRETCH, 'no two of them overlap'
     # stretches are cut at nodes, half a step ahead of their middle in the direction of driving
-    assert found.later == pytest.approx(found.earlier - 2 * STEP, abs=0.9 * STEP), 'those of a pair are nearest'
+    assert later == pytest.approx(earlier - 2 * STEP, abs=0.9 * STEP), 'those of a pair are nearest'
 
 
 def test_stretches_are_whole() -> None:
