@@ -49,8 +49,13 @@ FEWEST_STRETCHES = 4
 LEAST_T, LEAST_MEAN_BEND = 3.5, math.radians(0.5)
 """Least t, and least mean bend to one side, radians a metre: a radius of 115 m."""
 
-LEAST_SIGMAS, LEAST_BEND = 3.0, math.radians(0.6)
+LEAST_R_SIGMAS, LEAST_BEND = 3.0, math.radians(0.6)
 """Least atanh r in its standard deviations, and least bend √(Σ a_i b_i / n), radians a metre."""
+
+BENT = (
+    'walls at right angles do not fit: along them, odometry would make the same error whenever the robot comes to the '
+    'same place, so the walls there are probably bent, or at other angles'
+)
 
 
 class RepeatedErrors(NamedTuple):
@@ -100,7 +105,7 @@ def are_walls_bent(windows: Windows, nodes: Floats) -> bool:
     if bend >= LEAST_MEAN_BEND and t >= LEAST_T:
         return True
     bend, sigmas = found.common_bend
-    return bend >= LEAST_BEND and sigmas >= LEAST_SIGMAS
+    return bend >= LEAST_BEND and sigmas >= LEAST_R_SIGMAS
 
 
 def repeated_errors(windows: Windows, nodes: Floats) -> RepeatedErrors:

@@ -32,7 +32,7 @@ from .passes import Progress
 from .pose_graph import Solution
 from .poses import rms_after_alignment
 from .relocating import LEAST_RECOGNISED, confirmed_by_places, recognised, recognised_part
-from .repeated_errors import are_walls_bent
+from .repeated_errors import BENT, are_walls_bent
 from .scans import Scans
 from .solving import SETTLED, Solver
 from .walls import wall_votes
@@ -61,12 +61,6 @@ NOT_ENOUGH = ': this does not show that odometry is wrong'
 NO_WALLS = (
     'the echoes do not agree on directions of walls: this needs walls at right angles to each other beside the robot, '
     'and odometry with an accurate yaw over a few metres'
-)
-
-
-BENT = (
-    'walls at right angles do not fit: along them, odometry would make the same error whenever the robot comes to the '
-    'same place, so the walls there are probably bent, or at other angles'
 )
 
 

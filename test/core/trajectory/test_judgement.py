@@ -23,6 +23,7 @@ from forward_grid_mapper.core.trajectory.outcome import Refinement
 from forward_grid_mapper.core.trajectory.pose_graph import Solution, solution_at
 from forward_grid_mapper.core.trajectory.poses import rms_after_alignment
 from forward_grid_mapper.core.trajectory.refinement import Refiner
+from forward_grid_mapper.core.trajectory.repeated_errors import BENT
 from forward_grid_mapper.core.trajectory.scans import Scans
 from forward_grid_mapper.core.trajectory.solving import Solver
 from forward_grid_mapper.core.trajectory.windows import Odometry, Windows, cut
@@ -234,7 +235,7 @@ def test_bent_walls_are_not_used_but_matching_may_start_from_them(
         monkeypatch.setattr(right_angles, '_judged', lambda *rest: (judged(*rest)[0], refused))
     found = Refiner(Parameters()).run(*bent)
     assert not found.accepted and found.trajectory is bent[1]
-    assert found.reason.startswith(right_angles.BENT)
+    assert found.reason.startswith(BENT)
     assert found.gain == pytest.approx(0.02) if not proven else found.gain > 0.0
     assert len(starts) == 1 and starts[0] is asked[-1]
 
