@@ -28,6 +28,7 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
 from ..common.readings import Floats
 from .holding_out import REVISIT_AFTER
@@ -113,22 +114,25 @@ def repeated_errors(windows: Windows, nodes: Floats) -> RepeatedErrors:
     travel = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(nodes[:, :2], axis=0).T))])
     yaw = np.unwrap(nodes[:, 2])
     error, usable = _errors(windows, travel, yaw)
+    tree = cKDTree(nodes[:, :2])
     found, left = list[tuple[float, float, bool]](), usable.copy()
     for k in np.flatnonzero(usable).tolist():
         if not left[k]:
             continue
-        # travel increases, so earlier nodes are the first ones
-        before = int(np.searchsorted(travel, travel[k] - REVISIT_AFTER))
-        distance = np.hypot(*(nodes[:before, :2] - nodes[k, :2]).T)
-        angle = np.abs(wrapped(yaw[:before] - yaw[k]))
-        same = left[:before] & (distance < SAME_PLACE) & (np.minimum(angle, math.pi - angle) < SAME_AXIS)
+        near = np.sort(np.array(tree.query_ball_point(nodes[k, :2], SAME_PLACE), np.int64))
+        near = near[left[near] & (travel[near] < travel[k] - REVISIT_AFTER)]
+        angle = np.abs(wrapped(yaw[near] - yaw[k]))
+        same = np.minimum(angle, math.pi - angle) < SAME_AXIS
         if not same.any():
             continue
-        other = int(np.argmin(np.where(same, distance, np.inf)))
-        opposite = bool(angle[other] > math.pi / 2)
+        near, angle = near[same], angle[same]
+        closest = int(np.hypot(*(nodes[near, :2] - nodes[k, :2]).T).argmin())
+        other, opposite = int(near[closest]), bool(angle[closest] > math.pi / 2)
         found.append((error[other], -error[k] if opposite else error[k], opposite))
         for used in (k, other):
-            left &= np.abs(travel - travel[used]) >= STRETCH
+            # travel increases, so nodes less than a stretch away follow each other
+            first = np.searchsorted(travel, travel[used] - STRETCH, side='right')
+            left[first : np.searchsorted(travel, travel[used] + STRETCH)] = False
     table = np.array(found, np.float64).reshape(-1, 3)
     return RepeatedErrors(table[:, 0], table[:, 1], table[:, 2] > 0.0)
 

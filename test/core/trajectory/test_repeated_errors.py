@@ -13,12 +13,14 @@ import pytest
 from forward_grid_mapper.core.common.parameters import Parameters
 from forward_grid_mapper.core.common.readings import Floats
 from forward_grid_mapper.core.trajectory import right_angles
-from forward_grid_mapper.core.trajectory.poses import rms_after_alignment
+from forward_grid_mapper.core.trajectory.holding_out import REVISIT_AFTER
+from forward_grid_mapper.core.trajectory.poses import rms_after_alignment, wrapped
 from forward_grid_mapper.core.trajectory.refinement import Refiner
 from forward_grid_mapper.core.trajectory.repeated_errors import (
     FEWEST_STRETCHES,
     LEAST_BEND,
     LEAST_MEAN_BEND,
+    SAME_AXIS,
     SAME_PLACE,
     STRETCH,
     RepeatedErrors,
@@ -46,6 +48,41 @@ def out_and_back(metres: float, rounds: int = 1) -> tuple[Floats, Floats]:
     x = np.tile(one, rounds)
     yaw = np.tile(np.concatenate([np.zeros(len(out)), np.full(len(out), math.pi)]), rounds)
     return np.column_stack([x, np.zeros(len(x)), yaw]), x
+
+
+def pairs_by_brute_force(windows: Any, nodes: Floats) -> list[tuple[float, float, bool]]:
+    """The rows of `repeated_errors`, from all pairs of nodes."""
+    travel = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(nodes[:, :2], axis=0).T))])
+    yaw = np.unwrap(nodes[:, 2])
+    error, usable = _errors(windows, travel, yaw)
+    found, used = list[tuple[float, float, bool]](), list[float]()
+    for k in range(len(nodes)):
+        best, closest = None, SAME_PLACE
+        for j in [k, *range(k)]:
+            free = usable[j] and all(abs(travel[j] - at) >= STRETCH for at in used)
+            if not free and j == k:
+                break
+            apart, angle = math.hypot(*(nodes[j, :2] - nodes[k, :2])), abs(float(wrapped(yaw[j] - yaw[k])))
+            along = min(angle, math.pi - angle) < SAME_AXIS
+            if free and along and travel[j] < travel[k] - REVISIT_AFTER and apart < closest:
+                best, closest = j, apart
+        if best is not None:
+            opposite = abs(float(wrapped(yaw[best] - yaw[k]))) > math.pi / 2
+            found.append((error[best], -error[k] if opposite else error[k], opposite))
+            used += [travel[k], travel[best]]
+    return found
+
+
+@pytest.mark.parametrize('seed', range(8))
+def test_pairs_of_stretches_are_those_of_brute_force(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    nodes, _ = out_and_back(rng.uniform(12.0, 30.0), 2)
+    nodes = nodes + rng.normal(0.0, 1.0, nodes.shape) * np.array([0.05, 0.3, 0.2])
+    windows = windows_with(nodes[:, 2] + rng.normal(0.0, 0.02, len(nodes)).cumsum())
+    earlier, later, opposite = repeated_errors(windows, nodes)
+    expected = pairs_by_brute_force(windows, nodes)
+    assert len(expected) >= 2
+    assert [*zip(earlier.tolist(), later.tolist(), opposite.tolist(), strict=True)] == expected
 
 
 @pytest.mark.parametrize(('degrees', 'bent'), [(1.2, True), (-1.2, True), (0.8, True), (0.2, False), (0.0, False)])
