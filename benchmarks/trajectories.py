@@ -10,7 +10,8 @@
     python benchmarks/trajectories.py --distance 250 500 1000    # growth of time and memory
 
 Each run prints the absolute trajectory error (rms after rigid alignment, metres) of odometry and of the result of
-`Refiner`, whether this was accepted, and the time of one core for each metre; each group ends with a summary. Maps of
+`Refiner`, how much larger than the true path the result is, whether it was accepted, and the time of one core for each
+metre; each group ends with a summary. Maps of
 recordings are scored as well, by ../shared/tools/score_map.py with --align. With --maps, so are maps of simulated runs,
 from exact poses, from odometry, and from the result; the latter two are aligned with the exact poses.
 """
@@ -134,20 +135,31 @@ def worlds(seed: int) -> dict[str, tuple[World, np.ndarray]]:
     }
 
 
+def size_error(estimate: np.ndarray, true: np.ndarray) -> float:
+    """Return how much larger than the true one a path is, percent; both are poses of the same times, shape (N, 3)."""
+    a, b = estimate[:, :2] - estimate[:, :2].mean(0), true[:, :2] - true[:, :2].mean(0)
+    common = math.hypot((a * b).sum(), (a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]).sum())
+    return 100 * (float((a**2).sum()) / common - 1)
+
+
 def run(name: str, readings: Readings, odometry: Odometry, true: Odometry) -> dict[str, Any]:
     """Refine one drive, print a row and return its figures."""
     began = time.process_time()
     outcome = Refiner(Parameters()).run(readings, odometry)
     spent = 1e3 * (time.process_time() - began) / odometry.travel[-1]
     before, after = (rms_after_alignment(path.at(true.stamp), true.pose) for path in (odometry, outcome.trajectory))
+    larger = size_error(outcome.trajectory.at(true.stamp), true.pose)
     worse = after > before + max(0.02, 0.05 * before)
     taken = 'taken' if outcome.accepted else f'left: {outcome.reason}'
     print(
-        f'{name:<34} {before:7.2f} → {after:6.3f} m  {spent:4.0f} ms/m  {"WORSE  " if worse else ""}{taken}', flush=True
+        f'{name:<34} {before:7.2f} → {after:6.3f} m  {larger:+5.1f} %  {spent:4.0f} ms/m  '
+        f'{"WORSE  " if worse else ""}{taken}',
+        flush=True,
     )
     return {
         'before': before,
         'after': after,
+        'larger': larger,
         'worse': worse,
         'taken': outcome.accepted,
         'ms': spent,
@@ -261,9 +273,11 @@ def summary(title: str, rows: list[dict[str, Any]]) -> None:
     """Print a summary of a group of runs."""
     before, after, spent = (np.array([row[key] for row in rows], float) for key in ('before', 'after', 'ms'))
     taken, worse = (sum(bool(row[key]) for row in rows) for key in ('taken', 'worse'))
+    larger = [row['larger'] for row in rows if row['taken']] or [math.nan]
     print(
         f'{title:<34} {np.median(before):7.2f} → {np.median(after):6.3f} m in the median, {after.max():.2f} m at '
-        f'worst; {taken} of {len(rows)} taken, {worse} worse; {np.median(spent):.0f} ms/m'
+        f'worst; {taken} of {len(rows)} taken, {worse} worse; {np.median(larger):+.1f} % in size; '
+        f'{np.median(spent):.0f} ms/m'
     )
     if rows and 'exact' in rows[0]:
         exact, odometry, refined = (np.array([row[key] for row in rows]) for key in ('exact', 'odometry', 'refined'))
