@@ -80,7 +80,7 @@ def parser() -> argparse.ArgumentParser:
     made.add_argument(
         '--drift',
         choices=tuple(LEVELS),
-        help='drift of odometry: low, middle, high, or like the wheels of an old robot (default: no drift)',
+        help='drift of odometry: low, middle, high, like old wheels, or mostly in turns (default: none)',
     )
     made.add_argument(
         '--sonars', choices=sorted(SONARS), default='ring', help='ring of 24 (default) or front array of 8'

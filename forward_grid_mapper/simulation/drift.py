@@ -3,7 +3,8 @@
 Each small motion is measured in the robot's frame, travel and turn, and summed up with errors:
 
     travel' = travel · (1 + scale) + noise · √travel
-    turn'   = turn · (1 + turn_scale) + bias · travel + noise · √travel
+    aside'  = aside + noise · √travel
+    turn'   = turn · (1 + turn_scale) + bias · travel + noise · √travel + noise of turns · √turn
 
 `scale`, `turn_scale`, `bias` and `heading` (the direction of driving in the frame of odometry) are drawn once for a
 drive, since they depend on wheels and mounts; noise is drawn for every 5 cm, with the heavy tails of wheel slip.
@@ -23,6 +24,9 @@ from .drive import Recording
 
 STEP = 0.05
 """Metres of driving for each draw of noise; 0.15 rad of turning count as much."""
+
+TURN_STEP = 0.15
+"""Radians of turning for each draw of the noise of turns."""
 
 TAIL = 5.0
 """Degrees of freedom of Student's t for the noise of yaw; it has the stated variance."""
@@ -44,6 +48,10 @@ class Drift:
         Of travel, and of turning.
     heading : float
         Radians.
+    turn_noise : float
+        Radians a √radian.
+    side_noise : float
+        At right angles to the direction of driving, metres a √metre.
     """
 
     yaw_noise: float
@@ -52,6 +60,8 @@ class Drift:
     scale: float
     turn_scale: float = 0.01
     heading: float = 0.0
+    turn_noise: float = 0.0
+    side_noise: float = 0.0
 
 
 LEVELS = {
@@ -59,8 +69,12 @@ LEVELS = {
     'middle': Drift(math.radians(2.0), 0.015, math.radians(0.6), 0.015),
     'high': Drift(math.radians(3.0), 0.02, math.radians(1.0), 0.02),
     'wheels': Drift(math.radians(4.5), 0.02, math.radians(0.7), 0.03, 0.03, math.radians(1.3)),
+    'turns': Drift(
+        math.radians(1.0), 0.045, math.radians(0.3), 0.025, 0.03, math.radians(1.3), math.radians(8.0), 0.035
+    ),
 }
-"""Levels by name; `wheels` is what old research robots show beside a laser."""
+"""Levels by name; `wheels` has the yaw errors a metre of old research robots beside a laser, and `turns` has the errors
+where they make them: most of those of the yaw in turns."""
 
 
 def drifted(poses: Floats, drift: Drift, seed: int) -> Floats:
@@ -98,13 +112,29 @@ def drifted(poses: Floats, drift: Drift, seed: int) -> Floats:
     about = np.concatenate([[0.0], np.cumsum(tail)]) * drift.yaw_noise * unit
     ends = np.arange(count + 1) * STEP
     noise_along, noise_yaw = (np.diff(np.interp(progress, ends, walk)) for walk in (along, about))
-    ahead = ahead * (1.0 + scale) + noise_along
-    turns = turns * (1.0 + turn_scale) + bias * travel + noise_yaw
+    of_turns, aside_noise = _further_noise(drift, np.abs(turns), progress, seed)
+    ahead, aside = ahead * (1.0 + scale) + noise_along, aside + aside_noise
+    turns = turns * (1.0 + turn_scale) + bias * travel + noise_yaw + of_turns
     measured = poses[0, 2] + np.concatenate([[0.0], np.cumsum(turns)])
     direction = measured[:-1] + turns / 2 - np.diff(yaw) / 2 + heading
     c, s = np.cos(direction), np.sin(direction)
     moved = np.stack([c * ahead - s * aside, s * ahead + c * aside], axis=1)
     return np.column_stack([np.concatenate([poses[:1, :2], poses[0, :2] + np.cumsum(moved, axis=0)]), measured])
+
+
+def _further_noise(drift: Drift, turned: Floats, progress: Floats, seed: int) -> tuple[Floats, Floats]:
+    """Return the noise of turns and that aside of each motion, both of the shape of `turned`, radians."""
+    rng = np.random.default_rng([seed, 78])
+    angle = np.concatenate([[0.0], np.cumsum(turned)])
+    count = int(angle[-1] / TURN_STEP) + 2
+    tail = rng.standard_t(TAIL, count) / math.sqrt(TAIL / (TAIL - 2.0))
+    of_turns = np.concatenate([[0.0], np.cumsum(tail)]) * drift.turn_noise * math.sqrt(TURN_STEP)
+    steps = int(progress[-1] / STEP) + 2
+    aside = np.concatenate([[0.0], np.cumsum(rng.standard_normal(steps))]) * drift.side_noise * math.sqrt(STEP)
+    return (
+        np.diff(np.interp(angle, np.arange(count + 1) * TURN_STEP, of_turns)),
+        np.diff(np.interp(progress, np.arange(steps + 1) * STEP, aside)),
+    )
 
 
 def with_drift(recording: Recording, drift: Drift, seed: int) -> Recording:

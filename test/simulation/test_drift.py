@@ -42,6 +42,24 @@ def test_yaw_error_grows_with_the_square_root_of_the_distance() -> None:
     assert long == pytest.approx(math.radians(12.0), rel=0.2)
 
 
+def test_noise_of_turns_grows_with_the_square_root_of_the_angle() -> None:
+    level = Drift(0.0, 0.0, 0.0, 0.0, 0.0, turn_noise=math.radians(4.0))
+    assert drifted(straight(20.0), level, 0) == pytest.approx(straight(20.0))
+    for radians, sigma in ((1.0, 4.0), (9.0, 12.0)):
+        # there and back: both directions count
+        yaw = np.concatenate([np.linspace(0.0, radians / 2, 50), np.linspace(radians / 2, 0.0, 50)[1:]])
+        poses = np.column_stack([np.zeros_like(yaw), np.zeros_like(yaw), yaw])
+        ends = [drifted(poses, level, seed)[-1, 2] for seed in range(150)]
+        assert np.std(ends) == pytest.approx(math.radians(sigma), rel=0.2)
+
+
+def test_noise_aside_is_at_right_angles_to_the_drive() -> None:
+    level = Drift(0.0, 0.0, 0.0, 0.0, 0.0, side_noise=0.03)
+    ends = np.array([drifted(straight(16.0), level, seed)[-1] for seed in range(150)])
+    assert ends[:, 1].std() == pytest.approx(0.12, rel=0.2)
+    assert ends[:, 0] == pytest.approx(straight(16.0)[-1, 0])
+
+
 def test_bias_and_scale_are_constant_over_a_drive() -> None:
     level = Drift(0.0, 0.0, 0.02, 0.05, 0.0)
     poses = drifted(straight(10.0), level, 3)
