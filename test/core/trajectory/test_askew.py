@@ -148,12 +148,12 @@ def test_exact_odometry_in_both_parts_is_kept(exact: Recording) -> None:
 def test_beliefs_of_two_places_equal_a_sum_over_all_pairs_of_states(bent, askew: tuple[float, ...]) -> None:
     windows = bent[2]
     at, votes = wall_votes(windows, np.zeros(len(windows), bool))
-    drifts = Drifts(0.01, 0.02, 0.05)
+    drifts = Drifts(0.01, 0.02, 0.05, 0.09)
     chain = module._Chain(windows, at[3:5], votes[3:5], askew)
     count, states = len(askew), module.STATES
     moved = drifts.bias * chain.length[0] + drifts.turn_scale * chain.turn[0]
     sigma = math.sqrt(
-        drifts.noise**2 * chain.length[0] + module.TURN_NOISE**2 * chain.turned[0] + module.LEAST_NOISE**2
+        drifts.noise**2 * chain.length[0] + drifts.turn_noise**2 * chain.turned[0] + module.LEAST_NOISE**2
     )
     x = (chain.grid - moved + math.pi / 4) % (math.pi / 2) - math.pi / 4
     density = (1 - module.SLIPS) * np.exp(-0.5 * (x / sigma) ** 2) + module.SLIPS / 3 * np.exp(

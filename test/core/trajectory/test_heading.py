@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from forward_grid_mapper.core.trajectory import heading as module
-from forward_grid_mapper.core.trajectory.heading import LEAST_GAIN, NOISES, heading, yaws_of_votes
+from forward_grid_mapper.core.trajectory.heading import LEAST_GAIN, NOISES, TURN_NOISES, Heading, heading, yaws_of_votes
 from forward_grid_mapper.core.trajectory.odometry_model import calibrated, motions, sensitivity, with_yaw
 from forward_grid_mapper.core.trajectory.poses import wrapped
 from forward_grid_mapper.core.trajectory.walls import (
@@ -28,7 +28,7 @@ from forward_grid_mapper.core.trajectory.walls import (
     wall_votes,
 )
 from forward_grid_mapper.core.trajectory.windows import Odometry, Windows, corrected, cut
-from forward_grid_mapper.simulation.drift import LEVELS, odometry_of, with_drift
+from forward_grid_mapper.simulation.drift import LEVELS, Drift, odometry_of, with_drift
 from forward_grid_mapper.simulation.drive import Recording, drive
 from forward_grid_mapper.simulation.sonar import NOISY, front_array
 from forward_grid_mapper.simulation.world import building_tour, building_world
@@ -237,6 +237,39 @@ def test_given_noise_is_not_estimated(bent) -> None:
     assert found is not None
     assert found.drifts.noise == 0.055
     assert heading(windows, at, votes).drifts.noise in NOISES
+
+
+@pytest.mark.parametrize(('travel', 'turns', 'expected'), [(2.0, 0.0, 0), (0.0, 8.0, 1)])
+def test_noise_of_turns_is_found_where_wheels_have_it(
+    tour, monkeypatch, travel: float, turns: float, expected: int
+) -> None:
+    found, pair = [], module._with_noise_of_turns
+
+    def noted(*given) -> module.Drifts:
+        drifts = pair(*given)
+        found.append(drifts)
+        return drifts
+
+    monkeypatch.setattr(module, '_with_noise_of_turns', noted)
+    for seed in range(4):
+        level = Drift(math.radians(travel), 0.0, 0.0, 0.0, 0.0, turn_noise=math.radians(turns))
+        recording = with_drift(tour, level, seed)
+        windows = cut(recording.readings, odometry_of(recording))
+        heading(windows, *wall_votes(windows, np.zeros(len(windows), bool)))
+    assert np.median([min(TURN_NOISES.index(drifts.turn_noise), 1) for drifts in found]) == expected
+    assert all(drifts.noise in NOISES for drifts in found)
+
+
+def test_heading_is_less_certain_with_wheels_that_err_in_turns(tour, monkeypatch) -> None:
+    recording = with_drift(tour, Drift(0.0, 0.0, 0.0, 0.0, 0.0, turn_noise=math.radians(8.0)), 0)
+    windows = cut(recording.readings, odometry_of(recording))
+
+    def found() -> Heading:
+        return heading(windows, *wall_votes(windows, np.zeros(len(windows), bool)))
+
+    certain = found().certainty
+    monkeypatch.setattr(module, 'TURN_NOISES', TURN_NOISES[:1])
+    assert certain < found().certainty
 
 
 def test_exact_odometry_is_more_likely_than_any_drift(tour, true) -> None:
