@@ -2,9 +2,11 @@
 
     python benchmarks/wheel_noise.py --shared ../shared/data
 
-For stretches of several lengths, prints the systematic errors (least squares) and the noise that remains. The variance
-of the noise is a sum of a part for each metre of travel and one for each radian of turning (least squares without
-negative parts), so each noise has two standard deviations: a √metre, and a √radian.
+For stretches of several lengths, prints the systematic errors (least squares) and the noise that remains, along the
+robot, across it, and of its yaw. The variance of the noise is a sum of a part for each metre of travel and one for each
+radian of turning (least squares without negative parts), so each noise has two standard deviations: a √metre, and a
+√radian. Stretches have the same progress; a radian of turning counts as a third of a metre. Short drives do not tell
+the two parts apart well, and the errors of the corrected odometry count as noise.
 """
 
 from __future__ import annotations
@@ -34,8 +36,7 @@ def sums(values: np.ndarray, progress: np.ndarray, ends: np.ndarray) -> np.ndarr
 
 def noise_of(residual: np.ndarray, travel: np.ndarray, turned: np.ndarray) -> np.ndarray:
     """Return the standard deviations of residuals, a √metre of travel and a √radian of turning, shape (2,)."""
-    weight = 1.0 / (travel + turned / 3.0)
-    parts, _ = nnls(np.stack([travel, turned], axis=1) * weight[:, None], residual**2 * weight)
+    parts, _ = nnls(np.stack([travel, turned], axis=1), residual**2)
     out: np.ndarray = np.sqrt(parts)
     return out
 
@@ -45,10 +46,10 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument('--shared', type=Path, required=True, help='folder of the recordings')
     folder = parser.parse_args().shared
-    for name in RECORDINGS:
-        if not (folder / name).exists():
-            print(f'{name}: not at {folder}')
-            continue
+    present = [name for name in RECORDINGS if (folder / name / 'bag').exists()]
+    if not present:
+        parser.error(f'none of {", ".join(RECORDINGS)} is in {folder}')
+    for name in present:
         measured, true = (
             Odometry.of(*read_drive(folder / name / 'bag', Parameters(), {}, None, topic).associator.odometry)
             for topic in ('/odom', '/odom_corrected')

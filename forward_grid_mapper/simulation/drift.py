@@ -1,13 +1,16 @@
 """Drift of wheel odometry: adds errors to the exact odometry of a simulated drive.
 
-Each small motion is measured in the robot's frame, travel and turn, and summed up with errors:
+Each small motion is measured in the robot's frame, travel, aside and turn, and summed up with errors:
 
-    travel' = travel · (1 + scale) + noise · √travel
-    aside'  = aside + noise · √travel
-    turn'   = turn · (1 + turn_scale) + bias · travel + noise · √travel + noise of turns · √turn
+    travel' = travel · (1 + scale) + travel_noise · √progress
+    aside'  = aside + side_noise · √progress
+    turn'   = turn · (1 + turn_scale) + bias · travel + yaw_noise · √progress + turn_noise · √|turn|
+
+where progress = travel + |turn| / 3, in metres and radians.
 
 `scale`, `turn_scale`, `bias` and `heading` (the direction of driving in the frame of odometry) are drawn once for a
-drive, since they depend on wheels and mounts; noise is drawn for every 5 cm, with the heavy tails of wheel slip.
+drive, since they depend on wheels and mounts; noise is drawn for every 5 cm
+of progress and every 0.15 rad of turning, that of the yaw with the heavy tails of wheel slip.
 """
 
 from __future__ import annotations
@@ -23,10 +26,10 @@ from ..core.trajectory.windows import Odometry
 from .drive import Recording
 
 STEP = 0.05
-"""Metres of driving for each draw of noise; 0.15 rad of turning count as much."""
+"""Metres of driving for each draw of noise."""
 
 TURN_STEP = 0.15
-"""Radians of turning for each draw of the noise of turns."""
+"""Radians of turning that count as much, and for each draw of the noise of turns."""
 
 TAIL = 5.0
 """Degrees of freedom of Student's t for the noise of yaw; it has the stated variance."""
@@ -73,8 +76,8 @@ LEVELS = {
         math.radians(1.0), 0.045, math.radians(0.3), 0.025, 0.03, math.radians(1.3), math.radians(8.0), 0.035
     ),
 }
-"""Levels by name; `wheels` has the yaw errors a metre of old research robots beside a laser, and `turns` has the errors
-where they make them: most of those of the yaw in turns."""
+"""Levels by name. `wheels` has about as much noise of the yaw a metre as an old research robot beside a laser, and
+`turns` has most of it in turns, as that robot does."""
 
 
 def drifted(poses: Floats, drift: Drift, seed: int) -> Floats:
@@ -104,7 +107,7 @@ def drifted(poses: Floats, drift: Drift, seed: int) -> Floats:
     c, s = np.cos(yaw[:-1]), np.sin(yaw[:-1])
     ahead, aside = c * steps[:, 0] + s * steps[:, 1], -s * steps[:, 0] + c * steps[:, 1]
     travel = np.hypot(ahead, aside)
-    progress = np.concatenate([[0.0], np.cumsum(travel + np.abs(turns) * STEP / 0.15)])
+    progress = np.concatenate([[0.0], np.cumsum(travel + np.abs(turns) * STEP / TURN_STEP)])
     count = int(progress[-1] / STEP) + 2
     unit = math.sqrt(STEP)
     along = np.concatenate([[0.0], np.cumsum(rng.standard_normal(count))]) * drift.travel_noise * unit
@@ -123,7 +126,7 @@ def drifted(poses: Floats, drift: Drift, seed: int) -> Floats:
 
 
 def _further_noise(drift: Drift, turned: Floats, progress: Floats, seed: int) -> tuple[Floats, Floats]:
-    """Return the noise of turns and that aside of each motion, both of the shape of `turned`, radians."""
+    """Return the noise of turns, radians, and that aside, metres, of each motion; `turned` is in radians."""
     rng = np.random.default_rng([seed, 78])
     angle = np.concatenate([[0.0], np.cumsum(turned)])
     count = int(angle[-1] / TURN_STEP) + 2

@@ -7,8 +7,9 @@ of the map. δ changes as odometry drifts,
 
 and the votes of walls are its likelihood at each place. The belief over all values of δ is kept, so the heading is not
 lost in a hall or by a slip. Bias, turn scale and noise maximise the likelihood of all votes; for this δ is filtered
-modulo 90°, as walls determine it. Then δ is filtered around the full circle, with tempered votes and larger noise,
-since each echo votes several times. This gives the probability that a right angle was lost, and where.
+modulo 90°, as walls determine it. Then δ is filtered around the full circle, with tempered votes and larger noise of
+travel, since each echo votes several times, and with the likeliest noise of turns. This gives the probability that a
+right angle was lost, and where.
 
 Parts of a building may stand at an angle to each other. So the state also has the direction of the walls beside the
 robot: one of a few, which seldom changes. A direction is added if votes are much likelier with it.
@@ -105,7 +106,8 @@ class Drifts(NamedTuple):
     turn_scale : float
         Fraction of each turn.
     noise, turn_noise : float
-        σ of the noise: radians a √metre of travel, and radians a √radian of turning.
+        σ of the noise: radians a √metre of travel, and radians a √radian of turning. The noise of turns is estimated
+        only for the probability that a right angle was lost; otherwise it is the smallest of `TURN_NOISES`.
     """
 
     bias: float
@@ -337,7 +339,7 @@ def heading(windows: Windows, at: NDArray[np.int64], votes: Floats, noises: Sequ
     # at the start of the drive any of the four right angles may be chosen
     first = chain.grid[int(chain.smooth(best)[0].sum(0).argmax())]
     start = (np.abs(circle.off(first)) < math.pi / 4).astype(np.float64)
-    belief = circle.smooth(_with_noise_of_turns(chain, best, noises), start)
+    belief = circle.smooth(_with_noise_of_turns(chain, best), start)
     correction, certain = _most_probable(circle, belief.sum(1))
     direction = np.array(directions)[belief.sum(2).argmax(1)]
     measured, information = yaws_of_votes(votes, windows.node[at, 2] - direction, correction)
@@ -370,9 +372,13 @@ def _fitted(chain: _Chain, drifts: Drifts, noises: Sequence[float]) -> tuple[Dri
     return drifts, _log_posterior(chain, drifts)
 
 
-def _with_noise_of_turns(chain: _Chain, drifts: Drifts, noises: Sequence[float]) -> Drifts:
-    """Return the drift with the likeliest pair of noises."""
-    tried = [drifts._replace(noise=noise, turn_noise=of_turns) for noise in noises for of_turns in TURN_NOISES]
+def _with_noise_of_turns(chain: _Chain, drifts: Drifts) -> Drifts:
+    """Return the drift with the likeliest noise of turns beside its noise of travel.
+
+    Found together, the noise of travel would be smaller. That is too small, since votes average over straight
+    stretches, and the heading would be called certain where these are long.
+    """
+    tried = [drifts._replace(turn_noise=of_turns) for of_turns in TURN_NOISES]
     return max(tried, key=lambda each: _log_posterior(chain, each))
 
 

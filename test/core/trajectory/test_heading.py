@@ -9,9 +9,10 @@ import numpy as np
 import pytest
 
 from forward_grid_mapper.core.trajectory import heading as module
-from forward_grid_mapper.core.trajectory.heading import LEAST_GAIN, NOISES, TURN_NOISES, Heading, heading, yaws_of_votes
+from forward_grid_mapper.core.trajectory.heading import LEAST_GAIN, NOISES, TURN_NOISES, heading, yaws_of_votes
 from forward_grid_mapper.core.trajectory.odometry_model import calibrated, motions, sensitivity, with_yaw
 from forward_grid_mapper.core.trajectory.poses import wrapped
+from forward_grid_mapper.core.trajectory.right_angles import LEAST_CERTAINTY
 from forward_grid_mapper.core.trajectory.walls import (
     BESIDE,
     BIN,
@@ -239,37 +240,41 @@ def test_given_noise_is_not_estimated(bent) -> None:
     assert heading(windows, at, votes).drifts.noise in NOISES
 
 
-@pytest.mark.parametrize(('travel', 'turns', 'expected'), [(2.0, 0.0, 0), (0.0, 8.0, 1)])
-def test_noise_of_turns_is_found_where_wheels_have_it(
-    tour, monkeypatch, travel: float, turns: float, expected: int
+@pytest.mark.parametrize('noises', [NOISES, (0.055,)])
+@pytest.mark.parametrize(('travel', 'turns', 'more'), [(2.0, 0.0, False), (0.0, 8.0, True)])
+def test_noise_of_turns_is_found_beside_that_of_travel(
+    tour, monkeypatch, travel: float, turns: float, more: bool, noises: tuple[float, ...]
 ) -> None:
-    found, pair = [], module._with_noise_of_turns
+    chosen, choose = [], module._with_noise_of_turns
 
     def noted(*given) -> module.Drifts:
-        drifts = pair(*given)
-        found.append(drifts)
-        return drifts
+        chosen.append(choose(*given))
+        return chosen[-1]
 
     monkeypatch.setattr(module, '_with_noise_of_turns', noted)
     for seed in range(4):
         level = Drift(math.radians(travel), 0.0, 0.0, 0.0, 0.0, turn_noise=math.radians(turns))
         recording = with_drift(tour, level, seed)
         windows = cut(recording.readings, odometry_of(recording))
-        heading(windows, *wall_votes(windows, np.zeros(len(windows), bool)))
-    assert np.median([min(TURN_NOISES.index(drifts.turn_noise), 1) for drifts in found]) == expected
-    assert all(drifts.noise in NOISES for drifts in found)
+        found = heading(windows, *wall_votes(windows, np.zeros(len(windows), bool)), noises)
+        assert chosen[-1].noise == found.drifts.noise
+        assert found.drifts.turn_noise == TURN_NOISES[0]
+    if noises is NOISES:
+        assert (np.median([drifts.turn_noise for drifts in chosen]) > TURN_NOISES[0]) == more
 
 
-def test_heading_is_less_certain_with_wheels_that_err_in_turns(tour, monkeypatch) -> None:
-    recording = with_drift(tour, Drift(0.0, 0.0, 0.0, 0.0, 0.0, turn_noise=math.radians(8.0)), 0)
+def test_lost_right_angle_of_wheels_that_err_in_turns_is_noticed(monkeypatch) -> None:
+    exact = drive(building_world(), building_tour(), 0.1, front_array(), NOISY, seed=61)
+    recording = with_drift(exact, LEVELS['turns'], 61)
     windows = cut(recording.readings, odometry_of(recording))
-
-    def found() -> Heading:
-        return heading(windows, *wall_votes(windows, np.zeros(len(windows), bool)))
-
-    certain = found().certainty
+    at, votes = wall_votes(windows, np.zeros(len(windows), bool))
+    found = heading(windows, at, votes)
+    off = windows.node[found.at, 2] + found.correction - odometry_of(exact).at(windows.node_stamp)[found.at, 2]
+    assert np.abs(off - off[0]).max() > math.pi / 4
+    assert found.certainty < LEAST_CERTAINTY
+    # the noise of travel alone does not explain the errors
     monkeypatch.setattr(module, 'TURN_NOISES', TURN_NOISES[:1])
-    assert certain < found().certainty
+    assert heading(windows, at, votes).certainty > found.certainty + 0.1
 
 
 def test_exact_odometry_is_more_likely_than_any_drift(tour, true) -> None:
