@@ -41,8 +41,8 @@ _DART = Outline([(1.0, 0.0), (-0.8, 0.75), (-0.4, 0.0), (-0.8, -0.75), (1.0, 0.0
 DPI = 150
 # Lengths of the page in inches.
 EDGE, HEAD, _FOOT, _LABELS, CAPTION, GAP = 0.3, 0.8, 0.8, 0.55, 0.42, 0.3
-# Below this width the legend would overlap the scale of probabilities.
-_MIN_WIDTH = 11.3
+# Below this width the longest legend, of a refined drive, would overlap the scale of probabilities.
+_MIN_WIDTH = 12.6
 # Most drives whose start and end are marked; most drives that are named, and most characters of each name.
 _MOST_MARKED, _MOST_NAMED, _NAME = 12, 4, 20
 WIDE = 2.6

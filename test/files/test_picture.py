@@ -157,6 +157,25 @@ def test_picture_does_not_depend_on_the_number_of_dots_at_once(tmp_path: Path, m
     assert (tmp_path / 'all.png').read_bytes() == (tmp_path / 'few.png').read_bytes()
 
 
+def test_longest_legend_does_not_overlap_the_scale_of_probabilities(tmp_path: Path, monkeypatch) -> None:
+    pytest.importorskip('matplotlib')
+    from matplotlib.figure import Figure
+
+    from forward_grid_mapper.files import drawing
+
+    figures, save = [], Figure.savefig
+    monkeypatch.setattr(Figure, 'savefig', lambda figure, path: figures.append(figure) or save(figure, path))
+    maps = made_maps(20, 150)
+    picture = compose(maps, PATH, '', None, odometry_xy=PATH + 0.1)._replace(unexplained_xy=np.zeros((2_345_678, 2)))
+    monkeypatch.setattr(drawing, '_draw_overlay', lambda *rest: None)
+    drawing.draw(tmp_path / 'maps.png', picture)
+    (figure,) = figures
+    legend = max(figure.legends, key=lambda row: len(row.get_texts()))
+    scale = figure.axes[-1]
+    left = min(scale.get_window_extent().x0, scale.title.get_window_extent().x0)
+    assert legend.get_window_extent().x1 < left
+
+
 def test_thinned_path_covers_the_same_pixels_and_ends() -> None:
     pytest.importorskip('matplotlib')
     from forward_grid_mapper.files.drawing import _thinned
