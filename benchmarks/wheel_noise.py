@@ -28,6 +28,9 @@ RECORDINGS = ('building_a', 'building_b', 'building_c')
 STRETCHES = (1.0, 2.0, 4.0)
 """Metres of progress of a stretch."""
 
+AXES = ('along', 'm'), ('across', 'm'), ('yaw', '°')
+"""The components of a motion, and their units."""
+
 
 def sums(values: np.ndarray, progress: np.ndarray, ends: np.ndarray) -> np.ndarray:
     """Return the sum of the values of each motion over each stretch."""
@@ -57,7 +60,7 @@ def main() -> None:
         exact = relative(true.pose[:-1], true.pose[1:])
         at = measured.at(true.stamp)
         error = relative(at[:-1], at[1:]) - exact
-        error[:, 2] = wrapped(error[:, 2])
+        in_units = np.column_stack([error[:, :2], np.degrees(wrapped(error[:, 2]))])
         travel, turned = np.hypot(exact[:, 0], exact[:, 1]), np.abs(exact[:, 2])
         progress = np.concatenate([[0.0], np.cumsum(travel + turned / 3.0)])
         print(f'{name}: {travel.sum():.0f} m, {math.degrees(turned.sum()):.0f}° turned')
@@ -68,10 +71,10 @@ def main() -> None:
             )
             regressors = np.stack([ahead, turn], axis=1)
             words = []
-            for axis, unit, factor in (('along', 'm', 1.0), ('across', 'm', 1.0), ('yaw', '°', math.degrees(1.0))):
-                values = factor * sums(error[:, ('along', 'across', 'yaw').index(axis)], progress, ends)
-                fit = np.linalg.lstsq(regressors, values, rcond=None)[0]
-                straight, turning = noise_of(values - regressors @ fit, of_travel, of_turns)
+            for (axis, unit), errors in zip(AXES, in_units.T, strict=True):
+                summed = sums(errors, progress, ends)
+                fit = np.linalg.lstsq(regressors, summed, rcond=None)[0]
+                straight, turning = noise_of(summed - regressors @ fit, of_travel, of_turns)
                 words.append(
                     f'{axis} {fit[0]:+.3f} {unit}/m {fit[1]:+.3f} {unit}/rad, noise {straight:.3f} {unit}/√m '
                     f'{turning:.3f} {unit}/√rad'

@@ -9,8 +9,8 @@ Each small motion is measured in the robot's frame, travel, aside and turn, and 
 where progress = travel + |turn| / 3, in metres and radians.
 
 `scale`, `turn_scale`, `bias` and `heading` (the direction of driving in the frame of odometry) are drawn once for a
-drive, since they depend on wheels and mounts; noise is drawn for every 5 cm
-of progress and every 0.15 rad of turning, that of the yaw with the heavy tails of wheel slip.
+drive, since they depend on wheels and mounts. Noise is drawn for every 5 cm of progress, and that of turns for every 0.15
+rad; noise of the yaw has the heavy tails of wheel slip.
 """
 
 from __future__ import annotations
@@ -26,10 +26,10 @@ from ..core.trajectory.windows import Odometry
 from .drive import Recording
 
 STEP = 0.05
-"""Metres of driving for each draw of noise."""
+"""Metres of progress for each draw of noise."""
 
 TURN_STEP = 0.15
-"""Radians of turning that count as much, and for each draw of the noise of turns."""
+"""Radians for each draw of the noise of turns; they are as much progress as `STEP`."""
 
 TAIL = 5.0
 """Degrees of freedom of Student's t for the noise of yaw; it has the stated variance."""
@@ -109,15 +109,16 @@ def drifted(poses: Floats, drift: Drift, seed: int) -> Floats:
     travel = np.hypot(ahead, aside)
     progress = np.concatenate([[0.0], np.cumsum(travel + np.abs(turns) * STEP / TURN_STEP)])
     count = int(progress[-1] / STEP) + 2
-    unit = math.sqrt(STEP)
-    along = np.concatenate([[0.0], np.cumsum(rng.standard_normal(count))]) * drift.travel_noise * unit
-    tail = rng.standard_t(TAIL, count) / math.sqrt(TAIL / (TAIL - 2.0))
-    about = np.concatenate([[0.0], np.cumsum(tail)]) * drift.yaw_noise * unit
-    ends = np.arange(count + 1) * STEP
-    noise_along, noise_yaw = (np.diff(np.interp(progress, ends, walk)) for walk in (along, about))
-    of_turns, aside_noise = _further_noise(drift, np.abs(turns), progress, seed)
-    ahead, aside = ahead * (1.0 + scale) + noise_along, aside + aside_noise
-    turns = turns * (1.0 + turn_scale) + bias * travel + noise_yaw + of_turns
+    noise_along = _random_walk(rng.standard_normal(count), drift.travel_noise, STEP, progress)
+    noise_yaw = _random_walk(_heavy_tailed(rng, count), drift.yaw_noise, STEP, progress)
+    # a generator of their own: the draws of the others do not depend on them
+    rng, turned = np.random.default_rng([seed, 78]), np.concatenate([[0.0], np.cumsum(np.abs(turns))])
+    noise_of_turns = _random_walk(
+        _heavy_tailed(rng, int(turned[-1] / TURN_STEP) + 2), drift.turn_noise, TURN_STEP, turned
+    )
+    noise_aside = _random_walk(rng.standard_normal(count), drift.side_noise, STEP, progress)
+    ahead, aside = ahead * (1.0 + scale) + noise_along, aside + noise_aside
+    turns = turns * (1.0 + turn_scale) + bias * travel + noise_yaw + noise_of_turns
     measured = poses[0, 2] + np.concatenate([[0.0], np.cumsum(turns)])
     direction = measured[:-1] + turns / 2 - np.diff(yaw) / 2 + heading
     c, s = np.cos(direction), np.sin(direction)
@@ -125,19 +126,17 @@ def drifted(poses: Floats, drift: Drift, seed: int) -> Floats:
     return np.column_stack([np.concatenate([poses[:1, :2], poses[0, :2] + np.cumsum(moved, axis=0)]), measured])
 
 
-def _further_noise(drift: Drift, turned: Floats, progress: Floats, seed: int) -> tuple[Floats, Floats]:
-    """Return the noise of turns, radians, and that aside, metres, of each motion; `turned` is in radians."""
-    rng = np.random.default_rng([seed, 78])
-    angle = np.concatenate([[0.0], np.cumsum(turned)])
-    count = int(angle[-1] / TURN_STEP) + 2
-    tail = rng.standard_t(TAIL, count) / math.sqrt(TAIL / (TAIL - 2.0))
-    of_turns = np.concatenate([[0.0], np.cumsum(tail)]) * drift.turn_noise * math.sqrt(TURN_STEP)
-    steps = int(progress[-1] / STEP) + 2
-    aside = np.concatenate([[0.0], np.cumsum(rng.standard_normal(steps))]) * drift.side_noise * math.sqrt(STEP)
-    return (
-        np.diff(np.interp(angle, np.arange(count + 1) * TURN_STEP, of_turns)),
-        np.diff(np.interp(progress, np.arange(steps + 1) * STEP, aside)),
-    )
+def _heavy_tailed(rng: np.random.Generator, count: int) -> Floats:
+    """Return draws from Student's t with a variance of 1, shape (count,)."""
+    out: Floats = rng.standard_t(TAIL, count) / math.sqrt(TAIL / (TAIL - 2.0))
+    return out
+
+
+def _random_walk(draws: Floats, sigma: float, step: float, ends: Floats) -> Floats:
+    """Return what a random walk adds between the places `ends`, shape (M,); it makes one draw for each `step`."""
+    walk = np.concatenate([[0.0], np.cumsum(draws)]) * sigma * math.sqrt(step)
+    out: Floats = np.diff(np.interp(ends, np.arange(len(walk)) * step, walk))
+    return out
 
 
 def with_drift(recording: Recording, drift: Drift, seed: int) -> Recording:

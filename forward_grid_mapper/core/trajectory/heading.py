@@ -3,13 +3,13 @@
 A hidden Markov model. Its state is δ, the correction of the yaw of odometry with which walls are parallel to the axes
 of the map. δ changes as odometry drifts,
 
-    δ' = δ + bias · travel + turn_scale · turn + noise
+    δ' = δ + bias · travel + turn_scale · turn + noise of travel and of turns
 
 and the votes of walls are its likelihood at each place. The belief over all values of δ is kept, so the heading is not
-lost in a hall or by a slip. Bias, turn scale and noise maximise the likelihood of all votes; for this δ is filtered
-modulo 90°, as walls determine it. Then δ is filtered around the full circle, with tempered votes and larger noise of
-travel, since each echo votes several times, and with the likeliest noise of turns. This gives the probability that a
-right angle was lost, and where.
+lost in a hall or by a slip. Bias, turn scale and noise of travel maximise the likelihood of all votes; for this δ is
+filtered modulo 90°, as walls determine it. Then δ is filtered around the full circle, with tempered votes and larger
+noise of travel, since each echo votes several times, and with the likeliest noise of turns. This gives the probability
+that a right angle was lost, and where.
 
 Parts of a building may stand at an angle to each other. So the state also has the direction of the walls beside the
 robot: one of a few, which seldom changes. A direction is added if votes are much likelier with it.
@@ -28,6 +28,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..common.readings import Floats
+from .doubts import doubts, slight
 from .hidden_markov import forward, smooth
 from .walls import DIRECTIONS, votes_for
 from .windows import Windows
@@ -50,7 +51,7 @@ NOISES = tuple(math.radians(v) for v in (0.5, 1.0, 2.0, 4.0))
 
 TURN_NOISES = tuple(math.radians(v) for v in (2.0, 4.0, 8.0))
 """Values of the noise of turns that are tried, radians a √radian. Some wheels make most of their errors in turns
-(`benchmarks/wheel_noise.py`), and then a right angle is lost there more easily than the noise of travel says."""
+(`benchmarks/wheel_noise.py`), and may lose a right angle there."""
 
 BIASES = np.radians(np.arange(-4.0, 4.01, 0.25))
 TURN_SCALES = np.arange(-0.08, 0.081, 0.02)
@@ -70,14 +71,7 @@ TEMPER, WIDER = 0.5, 1.5
 LEAST_GAIN = 0.12
 """Nats a vote by which the best heading must be likelier than chance to be accepted."""
 
-
 FEWEST_VOTES = 4
-
-DOUBTFUL, PAUSE = 0.02, 5
-"""Least probability that a right angle was lost at a doubtful place, and fewest votes between two such places."""
-
-NEGLIGIBLE = 1e-4
-"""Places with a smaller probability are ignored."""
 
 MOST_FURTHER_PARTS = 2
 """Most parts of a building that stand at an angle to the first one."""
@@ -253,44 +247,6 @@ def _most_probable(chain: _Chain, belief: Floats) -> tuple[Floats, Floats]:
     inside = belief * (np.abs(off) < math.pi / 4)
     mass = inside.sum(1)
     return np.unwrap(middle + (inside * off).sum(1) / mass), mass
-
-
-def doubts(at: NDArray[np.int64], certain: Floats) -> tuple[tuple[int, float], ...]:
-    """Return the nodes at which the probability that no right angle was lost decreases, and by how much.
-
-    Parameters
-    ----------
-    at : int64, shape (B,)
-    certain : float64, shape (B,)
-        This probability from the start of the drive to each node.
-    """
-    falls = _falls(certain)
-    out = []
-    for part in _doubtful(falls):
-        sums = np.cumsum(falls[part])
-        out.append((int(at[part[np.searchsorted(sums, sums[-1] / 2)]]), float(sums[-1])))
-    return tuple(out)
-
-
-def slight(at: NDArray[np.int64], certain: Floats) -> tuple[tuple[int, float], ...]:
-    """Return the nodes at which it decreases less than for a doubt, and by how much; the parameters of `doubts`."""
-    falls = _falls(certain)
-    for part in _doubtful(falls):
-        falls[part] = 0.0
-    return tuple((int(at[k]), float(falls[k])) for k in np.flatnonzero(falls > NEGLIGIBLE))
-
-
-def _falls(certain: Floats) -> Floats:
-    """Return the decrease of the running minimum at each place, shape (B,)."""
-    out: Floats = -np.diff(np.minimum.accumulate(certain), prepend=certain[0])
-    return out
-
-
-def _doubtful(falls: Floats) -> list[NDArray[np.int64]]:
-    """Return the runs of consecutive places that are doubtful."""
-    falling = np.flatnonzero(falls > DOUBTFUL / 10)
-    runs = np.split(falling, np.flatnonzero(np.diff(falling) > PAUSE) + 1)
-    return [run for run in runs if falls[run].sum() >= DOUBTFUL]
 
 
 def yaws_of_votes(votes: Floats, yaw: Floats, correction: Floats) -> tuple[Floats, Floats]:

@@ -12,7 +12,8 @@ from exact_tour import Tour, quietly, tour_with
 
 from forward_grid_mapper.core.common.readings import Floats
 from forward_grid_mapper.core.trajectory import hypotheses, solving
-from forward_grid_mapper.core.trajectory.heading import DOUBTFUL, Heading, doubts, slight
+from forward_grid_mapper.core.trajectory.doubts import DOUBTFUL, doubts, slight
+from forward_grid_mapper.core.trajectory.heading import Heading
 from forward_grid_mapper.core.trajectory.holding_out import LEAST_SIGMAS, Gain
 from forward_grid_mapper.core.trajectory.hypotheses import MOST_DOUBTFUL, solve_hypotheses
 from forward_grid_mapper.core.trajectory.judging import gain_at_revisits, gain_within_visits
