@@ -9,8 +9,8 @@ Each small motion is measured in the robot's frame, travel, aside and turn, and 
 where progress = travel + |turn| / 3, in metres and radians.
 
 `scale`, `turn_scale`, `bias` and `heading` (the direction of driving in the frame of odometry) are drawn once for a
-drive, since they depend on wheels and mounts. Noise is drawn for every 5 cm of progress, and that of turns for every 0.15
-rad; noise of the yaw has the heavy tails of wheel slip.
+drive, since they depend on wheels and mounts. Noise is drawn for every 5 cm of progress, and that of turns for every
+0.15 rad. Noise of the yaw has the heavy tails of wheel slip.
 """
 
 from __future__ import annotations
