@@ -27,6 +27,7 @@ from .after_jumps import Part, begins_of, parts_at, with_doubtful
 from .any_angle import MatchedDrive, match_drive
 from .attempt import ACCURACY, EXACT, Attempt, Drive, gain_words, refined
 from .certainty import LARGEST_SIGMA, yaw_errors
+from .fitting import gain_when_fitted
 from .holding_out import LEAST_SIGMAS, Gain, has_revisits, held_out, tears_apart
 from .judging import gain_at_revisits, gain_of_objective, gain_within_visits, is_worse_nearby
 from .jumps import MOST_JUMPS, jumps, without_outliers
@@ -147,7 +148,7 @@ class Refiner:
         if found is None:
             return _without_better(by_walls.refinement)
         nodes, scans = found.nodes, found.scans
-        if known is not None and gain_of_objective(scans, known, nodes).sigmas < LEAST_SIGMAS:
+        if known is not None and gain_when_fitted(scans, known, nodes).sigmas < LEAST_SIGMAS:
             return by_walls.refinement
         trajectory = refined(odometry, windows, nodes)
         off = differences(odometry, trajectory)
@@ -199,7 +200,7 @@ class Refiner:
             return None
         # neither must have been fitted to the windows that are predicted
         by_held_out = (gain_at_revisits,) if matched.scans is drive.scans else ()
-        for compared in (*by_held_out, gain_of_objective):
+        for compared in (*by_held_out, gain_when_fitted):
             try:
                 if compared(drive.scans, by_walls.nodes, nodes).sigmas >= LEAST_SIGMAS:
                     return None

@@ -148,7 +148,7 @@ def test_walls_are_tried_again_once_matching_shows_that_odometry_is_wrong(
     # first that over odometry, then that over walls
     gains = iter((1.0, held_out_gain))
     monkeypatch.setattr(refinement, 'gain_at_revisits', lambda *rest: Gain(next(gains), 0.1))
-    monkeypatch.setattr(refinement, 'gain_of_objective', lambda *rest: Gain(gain, 0.1))
+    monkeypatch.setattr(refinement, 'gain_when_fitted', lambda *rest: Gain(gain, 0.1))
     found = Refiner(Parameters()).run(readings, odometry)
     assert asked == [False, True] and found.accepted
     assert found.reason.startswith('walls; scan matching alone shows' if by_walls else 'walls are not assumed')
@@ -275,7 +275,7 @@ def test_walls_that_tear_apart_what_matching_brings_together_are_not_taken(bent,
     let_come_back(monkeypatch, lambda scans, nodes: bool(np.ptp(nodes[:, 0]) < 100.0))
     monkeypatch.setattr(refinement, 'gain_within_visits', lambda *rest: Gain(0.0, 0.1))
     monkeypatch.setattr(refinement, 'gain_at_revisits', lambda *rest: Gain(1.0, 0.1))
-    monkeypatch.setattr(refinement, 'gain_of_objective', lambda *rest: Gain(0.0, 0.1))
+    monkeypatch.setattr(refinement, 'gain_when_fitted', lambda *rest: Gain(0.0, 0.1))
     assert Refiner(Parameters()).run(readings, odometry).reason.startswith('walls are not assumed')
 
 
@@ -470,7 +470,7 @@ def test_matched_trajectory_is_judged_by_the_windows_that_were_held_out(bent, mo
     let_come_back(monkeypatch, lambda *rest: True)
     monkeypatch.setattr(refinement, 'confirmed_by_places', lambda *rest: True)
     monkeypatch.setattr(refinement, 'gain_within_visits', lambda *rest: Gain(0.0, 0.1))
-    monkeypatch.setattr(refinement, 'gain_of_objective', lambda *rest: Gain(0.0, 0.1))
+    monkeypatch.setattr(refinement, 'gain_when_fitted', lambda *rest: Gain(0.0, 0.1))
     monkeypatch.setattr(refinement, 'gain_at_revisits', gain_at_revisits)
     found = Refiner(Parameters()).run(readings, odometry)
     begin = EVERY // 2 if own_fold else 0

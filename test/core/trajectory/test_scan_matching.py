@@ -239,7 +239,7 @@ def test_objective_is_that_of_the_map_without_held_out_readings(scans) -> None:
 def test_reason_says_that_the_robot_came_back_only_if_it_did(bent, scans, matched, monkeypatch, again: bool) -> None:
     recording, odometry = bent
     monkeypatch.setattr(refinement, 'gain_at_revisits', lambda *rest: Gain(0.1, 0.01))
-    monkeypatch.setattr(refinement, 'gain_of_objective', lambda *rest: Gain(0.1, 0.01))
+    monkeypatch.setattr(refinement, 'gain_when_fitted', lambda *rest: Gain(0.1, 0.01))
     told = MatchedDrive(matched, [], np.inf, 0.0, scans)
     monkeypatch.setattr(refinement, 'match_drive', lambda *rest: told)
     monkeypatch.setattr(refinement, 'has_revisits', lambda *rest: again)
@@ -269,7 +269,7 @@ def test_matches_alone_replace_walls_only_with_a_much_larger_j(
     recording, odometry = bent
     attempt, told = by_walls(scans, recording, odometry), []
     monkeypatch.setattr(refinement, 'gain_at_revisits', lambda *rest: Gain(0.1, 0.01))
-    monkeypatch.setattr(refinement, 'gain_of_objective', lambda *rest: told.append(rest[1:]) or Gain(sigmas, 1.0))
+    monkeypatch.setattr(refinement, 'gain_when_fitted', lambda *rest: told.append(rest[1:]) or Gain(sigmas, 1.0))
     monkeypatch.setattr(refinement, 'match_drive', lambda *rest: MatchedDrive(matched, [], np.inf, 1.0, scans))
     found = Refiner(Parameters())._at_any_angle(
         Drive(recording.readings, odometry, scans.windows, scans), attempt, ACCURACY
