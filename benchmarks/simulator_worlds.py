@@ -1,7 +1,7 @@
 """Places like the worlds of well-known robot simulators, most of them without walls at right angles, for trajectories.
 
-And corridors that bend. The step for the scale was developed on the cave and the arena with seeds 0 and 1. Each
-function returns a world and the corners of a path through it, in metres.
+And corridors that bend, or have a corner that is not square. The step for the scale was developed on the cave and the
+arena with seeds 0 and 1. Each function returns a world and the corners of a path through it, in metres.
 """
 
 from __future__ import annotations
@@ -155,8 +155,41 @@ def bent_corridor(radius: float) -> Place:
     return world_of(f'radius {radius:g} m', walls, way[0]), np.array(way + way[-2::-1])
 
 
+def slanted_corridor(degrees: float) -> Place:
+    """Return a corridor along four sides of a block, one of which meets the next at this angle; twice around."""
+    width, height, half = 16.0, 9.0, 0.9
+    angle = math.radians(degrees)
+    middle = np.array([(0.0, 0.0), (width, 0.0), (width, height), (-height / math.tan(angle), height)])
+    along = np.roll(middle, -1, axis=0) - middle
+    along /= np.linalg.norm(along, axis=1, keepdims=True)
+    inwards = np.stack([-along[:, 1], along[:, 0]], axis=1)
+
+    def side(aside: float) -> Floats:
+        """Return the corners of the line this far inside of the middle of the corridor."""
+        out = np.empty_like(middle)
+        for k in range(len(middle)):
+            normals = inwards[[k - 1, k]]
+            out[k] = np.linalg.solve(normals, normals @ middle[k] + aside)
+        return out
+
+    outer = side(-half)
+    walls = [outline(side(half)), outline(outer)]
+    for k, corner in enumerate(outer):
+        length = math.dist(corner, outer[(k + 1) % len(outer)])
+        for part in (0.2 + 0.05 * k, 0.7 - 0.05 * k):
+            foot = corner + part * length * along[k]
+            step, deep = 0.6 * along[k], 0.3 * inwards[k]
+            walls.append(outline(np.array([foot, foot + step, foot + step + deep, foot + deep])))
+    way = np.concatenate([middle, middle, middle[:2]])
+    return world_of(f'corner of {degrees:g} degrees', walls, (0.0, 0.0)), way
+
+
 BENT: dict[str, Callable[[], Place]] = {
     f'radius {radius:g} m': partial(bent_corridor, radius) for radius in (30.0, 50.0, 80.0, 120.0, 1e6)
+}
+
+SLANTED: dict[str, Callable[[], Place]] = {
+    f'corner of {degrees:g}°': partial(slanted_corridor, degrees) for degrees in (65.0, 75.0, 80.0, 90.0)
 }
 
 PLACES: dict[str, Callable[[], Place]] = {f.__name__: f for f in (hexagon, house, arena, cave, warehouse)}

@@ -7,6 +7,7 @@
     python benchmarks/trajectories.py --drawn 12            # buildings of many materials, drawn at random
     python benchmarks/trajectories.py --simulators --maps   # places like the worlds of well-known simulators
     python benchmarks/trajectories.py --bent --level low    # corridors that bend, there and back
+    python benchmarks/trajectories.py --slanted --level wheels    # a corner that is not square, twice around
     python benchmarks/trajectories.py --distance 250 500 1000    # growth of time and memory
 
 Each run prints the absolute trajectory error (rms after rigid alignment, metres) of odometry and of the result of
@@ -31,7 +32,7 @@ from typing import Any
 import numpy as np
 from material_worlds import building_drive
 from quality_worlds import scoring_tool
-from simulator_worlds import BENT, PLACES
+from simulator_worlds import BENT, PLACES, SLANTED
 
 from forward_grid_mapper.core.common.grid import UNKNOWN
 from forward_grid_mapper.core.common.parameters import Parameters
@@ -301,6 +302,7 @@ def main() -> None:
     parser.add_argument('--drawn', type=int, help='this many buildings drawn at random, instead')
     parser.add_argument('--simulators', action='store_true', help='places like the worlds of simulators, instead')
     parser.add_argument('--bent', action='store_true', help='corridors that bend, instead')
+    parser.add_argument('--slanted', action='store_true', help='corridors with a corner that is not square, instead')
     parser.add_argument('--distance', type=float, nargs='+', help='metres of longer and longer drives, instead')
     options = parser.parse_args()
     warm_up()
@@ -318,7 +320,7 @@ def main() -> None:
             summary(f'drawn, {level}', rows)
         return
     seeds = range(options.first_seed, options.first_seed + options.seeds)
-    places = BENT if options.bent else PLACES if options.simulators else None
+    places = BENT if options.bent else SLANTED if options.slanted else PLACES if options.simulators else None
     worlds_of = worlds if places is None else lambda seed: {name: place() for name, place in places.items()}
     for robot in options.robot or ROBOTS:
         for level in options.level or ('none', *LEVELS):

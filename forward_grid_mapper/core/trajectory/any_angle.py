@@ -20,7 +20,7 @@ import numpy as np
 from ..common.errors import InputError
 from ..common.readings import Floats
 from .holding_out import LEAST_SIGMAS, OTHERS, held_out
-from .judging import gain_of_objective, gain_over_drive
+from .judging import gain_of_objective
 from .loops import Loop
 from .odometry_model import CALIBRATION, sensitivity
 from .passes import Progress
@@ -34,11 +34,6 @@ from .windows import Odometry
 
 REMAINING_YAW_NOISE = math.radians(3.0)
 """σ of the yaw error after scan matching, and after each round, radians a √metre."""
-
-WORTH_A_TRIAL = 1.5
-"""Standard errors by which scan matching must predict nearby readings better than the trajectory from walls; otherwise
-nothing more is tried. It was 3.5 to 7 in 3 drives where corners were wrongly taken for right angles, and 0 to 0.6 in 4
-others."""
 
 ROUNDS = 4
 """Most rounds of matching and loop closing."""
@@ -81,9 +76,9 @@ def match_drive(
 ) -> MatchedDrive | None:
     """Return the trajectory of a drive from matching alone; None if its J is not larger than that of odometry.
 
-    If the trajectory from walls is `known`, J must be larger than that of it as well, and scan matching must predict
-    readings better than it before more is tried. If few places are recognised, the search got lost somewhere. Small
-    changes then lead to other places, so it is repeated with other windows held out, and J decides.
+    If the trajectory from walls is `known`, J must be larger than that of it as well. If few places are recognised, the
+    search got lost somewhere. Small changes then lead to other places, so it is repeated with other windows held out,
+    and J decides.
 
     Parameters
     ----------
@@ -113,10 +108,7 @@ def match_drive(
         # more trust in readings does not help if nothing had a larger J than odometry
         if make is starts[-1] and best is None:
             break
-        nodes = make()
-        if known is not None and gain_over_drive(scans, known, nodes, start_stage('judgement')).sigmas < WORTH_A_TRIAL:
-            break
-        found = _match_repeatedly(odometry, scans, start_stage, nodes, remaining, value)
+        found = _match_repeatedly(odometry, scans, start_stage, make(), remaining, value)
         if found is not None:
             best, value = found, found.value
         # if most places are recognised another trial hardly helps

@@ -1,26 +1,29 @@
 """Fitting trajectories to their own maps, so that their J can be compared.
 
-J depends on centimetres and degrees within a metre or two as much as on where corridors lie. Trajectories that were
-solved with different trust in odometry differ in both. So before J decides between them, each is fitted to the map
-along it: all windows are matched with the map of all visits around them, and the pose graph of these matches, and of
-the shape that the trajectory had, is solved. This hardly moves a trajectory: places stay where they are.
+J depends on where corridors lie. It depends as much on small errors, of centimetres and degrees, within a metre or two.
+Trajectories that were solved with different trust in odometry have different small errors. So before J decides between
+two, each is fitted to the map along it. All windows that are not held out are matched with the map of the other windows
+around them, of all visits. Then a pose graph is solved. It has these matches, and the shape that the trajectory had.
+This hardly moves a trajectory: places stay where they are.
 """
 
 from __future__ import annotations
 
 import math
 from functools import partial
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from ..common.errors import InputError
 from ..common.readings import Floats
 from ..runtime.threads import in_order
 from .holding_out import LEAST_SIGMAS, NEAR, Gain
 from .judging import gain_of_objective
 from .matching import ENOUGH, Match, measure
 from .odometry_model import Noise, covariances
-from .passes import BLOCK, FEWEST
+from .passes import BLOCK, FEWEST, Progress
 from .pose_graph import Edges, Graph, no_walls, no_yaws, solve
 from .poses import axes_at, compose, relative
 from .scans import MOST_ON_MAP, Scans
@@ -29,62 +32,103 @@ SHAPE = Noise(yaw=math.radians(3.0))
 """Noise of the motions of a trajectory that is fitted; the same for all, however they were found."""
 
 ON_MAP, EVALUATED = 2 * MOST_ON_MAP, 2 * ENOUGH
-"""Most readings that a map is made from, and that are evaluated to measure a pose: there are several visits."""
+"""Most readings that a map is made from, and that are evaluated to measure a pose: twice as many as usual, since there
+are several visits on the map."""
 
 ROUNDS = 2
-"""Times that the windows are matched and the graph is solved; in more rounds, J hardly grows."""
+"""Times that the windows are matched and the graph is solved. If visits agree, J hardly grows in more rounds. If they
+do not, more rounds would slowly bend the trajectory until they do."""
 
 
-def gain_when_fitted(scans: Scans, before: Floats, after: Floats) -> Gain:
-    """Return the gain in J of one trajectory over another; if it is large, that after both were fitted.
+class _Placed(NamedTuple):
+    """A match of a window, in the frame of a node."""
 
-    The parameters are those of `gain_of_objective`.
+    frame: int
+    window: int
+    match: Match
+
+
+def gain_when_fitted(scans: Scans, before: Floats, after: Floats, watch: Progress = lambda part: None) -> Gain:
+    """Return the gain in J of `after` over `before`, nats a block.
+
+    If it is at least `LEAST_SIGMAS`, both are fitted first, and the gain is that of the fitted trajectories.
+
+    Parameters
+    ----------
+    scans : Scans
+    before, after : float64, shape (K, 3)
+        Nodes.
+    watch : callable
+        Receives the fraction of the work that is done.
+
+    Raises
+    ------
+    InputError
+        If the map along one of the trajectories is too large.
     """
     better = gain_of_objective(scans, before, after)
     if better.sigmas < LEAST_SIGMAS:
         return better
-    return gain_of_objective(scans, fitted(scans, before), fitted(scans, after))
+    first = fitted(scans, before, lambda part: watch(part / 2))
+    second = fitted(scans, after, lambda part: watch((1.0 + part) / 2))
+    try:
+        return gain_of_objective(scans, first, second)
+    except InputError:
+        # fitted trajectories may be some cells larger
+        return better
 
 
-def fitted(scans: Scans, nodes: Floats) -> Floats:
+def fitted(scans: Scans, nodes: Floats, watch: Progress = lambda part: None) -> Floats:
     """Return the nodes of a trajectory, shape (K, 3), fitted to the map along it; the first one stays."""
     motion = relative(nodes[:-1], nodes[1:])
     count = np.arange(len(nodes))
     information = np.asarray(np.linalg.inv(covariances(scans.windows, SHAPE)), np.float64)
     shape, no_calibration = Edges(count[:-1], count[1:], motion, information), np.zeros((len(motion), 3, 0))
-    for _ in range(ROUNDS):
-        matches = _matched_with_map(scans, nodes)
+    for k in range(ROUNDS):
+        matches = _matched_with_map(scans, nodes, partial(_in_round, watch, k))
         graph = Graph(shape, no_calibration, np.zeros(0), matches, no_yaws(), no_walls())
         nodes = solve(graph, nodes, np.zeros(0)).nodes
     return nodes
 
 
-def _matched_with_map(scans: Scans, nodes: Floats) -> Edges:
-    """Return the poses of windows on the map of all other windows around, as edges from the first node."""
+def _in_round(watch: Progress, k: int, part: float) -> None:
+    """Report the progress of round k."""
+    watch((k + part) / ROUNDS)
+
+
+def _matched_with_map(scans: Scans, nodes: Floats, watch: Progress) -> Edges:
+    """Return the poses of windows on the map of all other windows around, as edges from the first node.
+
+    The map stays where it is, so the edges begin at the node that is fixed. Their information is not reduced as in
+    `solving`: the result only has to fit its map.
+    """
     work = [
         partial(_matches, scans, nodes, np.arange(k, min(k + BLOCK, len(nodes)))) for k in range(0, len(nodes), BLOCK)
     ]
-    rows = [row for found in in_order(work, scans.threads) for row in found if row[1]]
-    frames = nodes[np.array([place for place, _, _ in rows], np.int64)]
-    measured = np.array([match.pose for _, _, match in rows]).reshape(-1, 3)
-    information = np.empty((len(rows), 3, 3))
-    for k, (_, _, match) in enumerate(rows):
+    placed: list[_Placed] = []
+    for done, found in enumerate(in_order(work, scans.threads)):
+        watch(done / len(work))
+        placed += [each for each in found if each.window > 0]
+    frames = nodes[np.array([each.frame for each in placed], np.int64)]
+    poses = np.array([each.match.pose for each in placed]).reshape(-1, 3)
+    information = np.empty((len(placed), 3, 3))
+    for k, each in enumerate(placed):
         axes = axes_at(frames[k, 2] - nodes[0, 2])
-        information[k] = axes @ match.information @ axes.T
-    window = np.array([window for _, window, _ in rows], np.int64)
-    return Edges(np.zeros(len(rows), np.int64), window, relative(nodes[0], compose(frames, measured)), information)
+        information[k] = axes @ each.match.information @ axes.T
+    window = np.array([each.window for each in placed], np.int64)
+    return Edges(np.zeros(len(placed), np.int64), window, relative(nodes[0], compose(frames, poses)), information)
 
 
-def _matches(scans: Scans, nodes: Floats, block: NDArray[np.int64]) -> list[tuple[int, int, Match]]:
-    """Return the matches of the windows of a block with that map: the node that is its frame, the window, the match."""
-    place = int(block[0])
+def _matches(scans: Scans, nodes: Floats, block: NDArray[np.int64]) -> list[_Placed]:
+    """Return the matches of the windows of a block with the map of all other windows around it."""
+    frame = int(block[0])
     near = np.hypot(*(nodes[:, :2] - nodes[block, :2].mean(0)).T) < NEAR
     near[block] = False
     members = np.flatnonzero(near)
-    around = scans.map(members, nodes[place], nodes, ON_MAP) if len(members) >= FEWEST else None
+    around = scans.map(members, nodes[frame], nodes, ON_MAP) if len(members) >= FEWEST else None
     if around is None:
         return []
     return [
-        (place, int(k), measure(scans.scan[k], around, relative(nodes[place], nodes[k]), EVALUATED))
+        _Placed(frame, int(k), measure(scans.scan[k], around, relative(nodes[frame], nodes[k]), EVALUATED))
         for k in block[scans.count[block] >= FEWEST]
     ]

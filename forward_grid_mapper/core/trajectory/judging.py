@@ -132,7 +132,7 @@ def gain_of_objective(scans: Scans, before: Floats, after: Floats) -> Gain:
     """Return the gain in J of one trajectory over another, nats a block; without held-out readings.
 
     Both trajectories were fitted to these readings, so a small gain means nothing. A large one shows that the other
-    trajectory contradicts itself.
+    trajectory contradicts itself, within a metre or two or as a whole; `fitting` distinguishes these.
     """
     (value, windows), (more, of_more) = (scans.explained(nodes) for nodes in (before, after))
     blocks = np.add.reduceat(of_more - windows, np.arange(0, len(windows), BLOCK))

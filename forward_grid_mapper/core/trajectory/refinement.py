@@ -148,8 +148,10 @@ class Refiner:
         if found is None:
             return _without_better(by_walls.refinement)
         nodes, scans = found.nodes, found.scans
-        if known is not None and gain_when_fitted(scans, known, nodes).sigmas < LEAST_SIGMAS:
-            return by_walls.refinement
+        if known is not None:
+            larger = gain_when_fitted(scans, known, nodes, self._start_stage('judgement'))
+            if larger.sigmas < LEAST_SIGMAS:
+                return by_walls.refinement
         trajectory = refined(odometry, windows, nodes)
         off = differences(odometry, trajectory)
         if off.within(least):

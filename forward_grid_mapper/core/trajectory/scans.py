@@ -22,7 +22,8 @@ FEWEST_ON_MAP = 30
 """Fewest readings that a local map is made from."""
 
 MOST_ON_MAP = 800
-"""Most readings that a local map is made from, drawn at random: more take time, and hardly change the map."""
+"""Usual largest number of readings that a local map is made from, drawn at random: more take time, and hardly change
+the map of one visit."""
 
 
 class Scans:

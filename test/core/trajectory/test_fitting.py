@@ -6,14 +6,17 @@ import math
 
 import numpy as np
 import pytest
+from pentagon_drive import quietly, scans_of
 
+from forward_grid_mapper.core.common.errors import Cancelled, InputError
 from forward_grid_mapper.core.common.readings import Floats
 from forward_grid_mapper.core.trajectory import fitting
 from forward_grid_mapper.core.trajectory.fitting import fitted, gain_when_fitted
-from forward_grid_mapper.core.trajectory.holding_out import LEAST_SIGMAS
+from forward_grid_mapper.core.trajectory.holding_out import LEAST_SIGMAS, Gain
 from forward_grid_mapper.core.trajectory.judging import gain_of_objective
 from forward_grid_mapper.core.trajectory.matching import measure
 from forward_grid_mapper.core.trajectory.poses import compose, relative, rms_after_alignment, wrapped
+from forward_grid_mapper.core.trajectory.scans import Scans
 from forward_grid_mapper.simulation.drift import odometry_of
 
 
@@ -71,13 +74,15 @@ def test_fitting_does_not_depend_on_the_frame(scans, rough, fitted_rough) -> Non
 
 
 def test_held_out_readings_have_no_effect(scans, rough) -> None:
-    found = fitting._matched_with_map(scans, rough)
+    found = fitting._matched_with_map(scans, rough, quietly)
     assert not scans.held_out[found.second].any()
     assert not found.first.any()
+    # the first node is fixed, but the other windows of its block are matched
+    assert found.second.tolist()[:2] == [k for k in (1, 2, 3) if not scans.held_out[k]][:2]
 
 
 def test_poses_are_those_on_the_map_of_all_other_windows_around(scans, rough) -> None:
-    found = fitting._matched_with_map(scans, rough)
+    found = fitting._matched_with_map(scans, rough, quietly)
     block = np.arange(40, 44)
     near = np.hypot(*(rough[:, :2] - rough[block, :2].mean(0)).T) < fitting.NEAR
     near[block] = False
@@ -102,6 +107,42 @@ def test_trajectories_are_compared_after_both_were_fitted(scans, true, rough) ->
     assert rms_after_alignment(wrong, true) > 2.0 * rms_after_alignment(rough, true)
     assert gain_of_objective(scans, rough, wrong).sigmas > LEAST_SIGMAS
     assert gain_when_fitted(scans, rough, wrong).sigmas < LEAST_SIGMAS
+
+
+def test_both_trajectories_are_fitted(scans, true, rough, fitted_rough, monkeypatch) -> None:
+    compared = []
+    monkeypatch.setattr(fitting, 'gain_of_objective', lambda s, *nodes: compared.append(nodes) or Gain(5.0, 1.0))
+    reported: list[float] = []
+    gain_when_fitted(scans, true, rough, reported.append)
+    (first, second), (_, of_rough) = compared
+    assert first is true and second is rough
+    np.testing.assert_array_equal(of_rough, fitted_rough)
+    assert reported == sorted(reported) and reported[0] == 0.0 and 0.9 < reported[-1] < 1.0
+
+
+def test_gain_is_that_before_fitting_if_a_fitted_trajectory_needs_too_large_a_map(scans, true, monkeypatch) -> None:
+    objective, known = Scans.explained, (scans.windows.node.tobytes(), true.tobytes())
+
+    def explained(self: Scans, nodes: Floats) -> tuple[float, Floats]:
+        if nodes.tobytes() not in known:
+            raise InputError('too large')
+        return objective(self, nodes)
+
+    monkeypatch.setattr(Scans, 'explained', explained)
+    better = gain_of_objective(scans, scans.windows.node, true)
+    assert gain_when_fitted(scans, scans.windows.node, true) == better
+
+
+def test_fitting_can_be_cancelled(bent, rough) -> None:
+    cancelled = scans_of(*bent)
+    cancelled._stop[0] = 1
+    with pytest.raises(Cancelled):
+        fitted(cancelled, rough)
+
+
+def test_without_matches_the_trajectory_stays(scans, rough) -> None:
+    far_apart = rough * (1e3, 1e3, 1.0)
+    np.testing.assert_allclose(fitted(scans, far_apart), far_apart, atol=1e-9)
 
 
 def test_a_much_better_trajectory_stays_so(scans, true) -> None:
