@@ -326,7 +326,7 @@ class PoseAssociator(MessageAccount):
         first = self.odometry_received - self.odometry_rejected.total() == 1
         self.jumps_before_begin += first and not len(self.buffer)
         for frame_id, count in Counter(
-            m.frame_id for m in (*self._without_pose, *(measured for measured, _, _ in self._without_extrinsics))
+            m.frame_id for m in (*sorted(self._without_pose), *(measured for measured, _, _ in self._without_extrinsics))
         ).items():
             self._reject(frame_id, 'time_jump', count)
         self._without_pose.clear()
