@@ -325,9 +325,8 @@ class PoseAssociator(MessageAccount):
         # as after a reset between two drives: the poses that are forgotten are those of the drive before
         first = self.odometry_received - self.odometry_rejected.total() == 1
         self.jumps_before_begin += first and not len(self.buffer)
-        for frame_id, count in Counter(
-            m.frame_id for m in (*sorted(self._without_pose), *(measured for measured, _, _ in self._without_extrinsics))
-        ).items():
+        waiting = [*sorted(self._without_pose), *(measured for measured, _, _ in self._without_extrinsics)]
+        for frame_id, count in Counter(measured.frame_id for measured in waiting).items():
             self._reject(frame_id, 'time_jump', count)
         self._without_pose.clear()
         self._without_extrinsics.clear()
