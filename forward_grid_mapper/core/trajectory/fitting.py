@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import math
 from functools import partial
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,9 +20,9 @@ from ..common.readings import Floats
 from ..runtime.threads import in_order
 from .holding_out import LEAST_SIGMAS, NEAR, Gain
 from .judging import gain_of_objective
-from .matching import ENOUGH, Match, measure
+from .matching import ENOUGH
 from .odometry_model import Noise, covariances
-from .passes import BLOCK, FEWEST, Progress
+from .passes import BLOCK, FEWEST, Progress, Row, matches_of
 from .pose_graph import Edges, Graph, no_walls, no_yaws, solve
 from .poses import axes_at, compose, relative
 from .scans import MOST_ON_MAP, Scans
@@ -38,14 +37,6 @@ are several visits on the map."""
 ROUNDS = 2
 """Times that the windows are matched and the graph is solved. If visits agree, J hardly grows in more rounds. If they
 do not, more rounds would slowly bend the trajectory until they do."""
-
-
-class _Placed(NamedTuple):
-    """A match of a window, in the frame of a node."""
-
-    frame: int
-    window: int
-    match: Match
 
 
 def gain_when_fitted(scans: Scans, before: Floats, after: Floats, watch: Progress = lambda part: None) -> Gain:
@@ -105,30 +96,26 @@ def _matched_with_map(scans: Scans, nodes: Floats, watch: Progress) -> Edges:
     work = [
         partial(_matches, scans, nodes, np.arange(k, min(k + BLOCK, len(nodes)))) for k in range(0, len(nodes), BLOCK)
     ]
-    placed: list[_Placed] = []
+    rows: list[Row] = []
     for done, found in enumerate(in_order(work, scans.threads)):
         watch(done / len(work))
-        placed += [each for each in found if each.window > 0]
-    frames = nodes[np.array([each.frame for each in placed], np.int64)]
-    poses = np.array([each.match.pose for each in placed]).reshape(-1, 3)
-    information = np.empty((len(placed), 3, 3))
-    for k, each in enumerate(placed):
+        # the first node is fixed
+        rows += [row for row in found if row[1] > 0]
+    frames = nodes[np.array([frame for frame, *_ in rows], np.int64)]
+    poses = np.array([match.pose for _, _, match, _ in rows]).reshape(-1, 3)
+    information = np.empty((len(rows), 3, 3))
+    for k, (_, _, match, _) in enumerate(rows):
         axes = axes_at(frames[k, 2] - nodes[0, 2])
-        information[k] = axes @ each.match.information @ axes.T
-    window = np.array([each.window for each in placed], np.int64)
-    return Edges(np.zeros(len(placed), np.int64), window, relative(nodes[0], compose(frames, poses)), information)
+        information[k] = axes @ match.information @ axes.T
+    window = np.array([window for _, window, _, _ in rows], np.int64)
+    return Edges(np.zeros(len(rows), np.int64), window, relative(nodes[0], compose(frames, poses)), information)
 
 
-def _matches(scans: Scans, nodes: Floats, block: NDArray[np.int64]) -> list[_Placed]:
+def _matches(scans: Scans, nodes: Floats, block: NDArray[np.int64]) -> list[Row]:
     """Return the matches of the windows of a block with the map of all other windows around it."""
-    frame = int(block[0])
     near = np.hypot(*(nodes[:, :2] - nodes[block, :2].mean(0)).T) < NEAR
     near[block] = False
     members = np.flatnonzero(near)
-    around = scans.map(members, nodes[frame], nodes, ON_MAP) if len(members) >= FEWEST else None
-    if around is None:
+    if len(members) < FEWEST:
         return []
-    return [
-        _Placed(frame, int(k), measure(scans.scan[k], around, relative(nodes[frame], nodes[k]), EVALUATED))
-        for k in block[scans.count[block] >= FEWEST]
-    ]
+    return matches_of(scans, nodes, block, members, int(block[0]), ON_MAP, EVALUATED)

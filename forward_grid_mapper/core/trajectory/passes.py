@@ -10,10 +10,10 @@ from numpy.typing import NDArray
 
 from ..common.readings import Floats
 from ..runtime.threads import in_order
-from .matching import Match, measure
+from .matching import ENOUGH, Match, measure
 from .pose_graph import Edges, no_edges
 from .poses import relative, rms_after_alignment
-from .scans import Scans
+from .scans import MOST_ON_MAP, Scans
 
 BLOCK = 4
 """Windows that are matched with one local map."""
@@ -104,7 +104,7 @@ def match_preceding(scans: Scans, nodes: Floats, watch: Progress) -> Matches:
         members = np.flatnonzero(behind < BEHIND)
         if len(members) >= FEWEST:
             place = int(members[np.abs(behind[members] - BACK).argmin()])
-            work.append(partial(_matches, scans, nodes, block, members, place))
+            work.append(partial(matches_of, scans, nodes, block, members, place))
     return _found(scans, work, watch)
 
 
@@ -117,7 +117,7 @@ def match_surrounding(scans: Scans, nodes: Floats, watch: Progress) -> Matches:
         near[block] = False
         members = np.flatnonzero(near)
         if len(members) >= FEWEST:
-            work.append(partial(_matches, scans, nodes, block, members, int(members[0])))
+            work.append(partial(matches_of, scans, nodes, block, members, int(members[0])))
     return _found(scans, work, watch)
 
 
@@ -131,14 +131,28 @@ def _found(scans: Scans, work: Sequence[Callable[[], list[Row]]], watch: Progres
     return found
 
 
-def _matches(
-    scans: Scans, nodes: Floats, block: NDArray[np.int64], members: NDArray[np.int64], place: int
+def matches_of(
+    scans: Scans,
+    nodes: Floats,
+    block: NDArray[np.int64],
+    members: NDArray[np.int64],
+    place: int,
+    on_map: int = MOST_ON_MAP,
+    evaluated: int = ENOUGH,
 ) -> list[Row]:
-    """Return the matches of a block's windows with the map of the windows `members`, in the frame of `place`."""
-    around = scans.map(members, nodes[place], nodes)
+    """Return the matches of a block's windows with the map of the windows `members`, in the frame of `place`.
+
+    The map is made from `on_map` readings at most, and `evaluated` of a window measure its pose.
+    """
+    around = scans.map(members, nodes[place], nodes, on_map)
     if around is None:
         return []
     return [
-        (place, int(j), measure(scans.scan[j], around, relative(nodes[place], nodes[j])), int(scans.count[j]))
+        (
+            place,
+            int(j),
+            measure(scans.scan[j], around, relative(nodes[place], nodes[j]), evaluated),
+            int(scans.count[j]),
+        )
         for j in block[scans.count[block] >= FEWEST]
     ]

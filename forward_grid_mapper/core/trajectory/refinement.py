@@ -204,7 +204,7 @@ class Refiner:
         by_held_out = (gain_at_revisits,) if matched.scans is drive.scans else ()
         for compared in (*by_held_out, gain_when_fitted):
             try:
-                if compared(drive.scans, by_walls.nodes, nodes).sigmas >= LEAST_SIGMAS:
+                if compared(drive.scans, by_walls.nodes, nodes, self._start_stage('judgement')).sigmas >= LEAST_SIGMAS:
                     return None
             except InputError:
                 # the map along this trajectory is too large
