@@ -26,7 +26,7 @@ from .odometry_model import CALIBRATION, sensitivity
 from .passes import Progress
 from .pose_graph import solution_at
 from .poses import relative, rms_after_alignment
-from .relocating import LEAST_RECOGNISED, recognised_part
+from .relocating import LEAST_RECOGNISED, fitting_part
 from .scan_matching import TRUSTS, Trust, scan_matched
 from .scans import Scans
 from .solving import SETTLED, MatchSolver
@@ -54,7 +54,7 @@ class MatchedDrive(NamedTuple):
     value : float
         `Scans.objective` of the nodes, nats.
     part : float
-        Fraction of the blocks on an earlier visit that are recognised.
+        Fraction of the blocks on an earlier visit that are recognised or fit where they lie.
     scans : Scans
         With the windows that were held out.
     """
@@ -76,9 +76,9 @@ def match_drive(
 ) -> MatchedDrive | None:
     """Return the trajectory of a drive from matching alone; None if its J is not larger than that of odometry.
 
-    If the trajectory from walls is `known`, J must be larger than that of it as well. If few places are recognised, the
-    search got lost somewhere. Small changes then lead to other places, so it is repeated with other windows held out,
-    and J decides.
+    If the trajectory from walls is `known`, J must be larger than that of it as well. If few blocks fit the map of
+    earlier visits, the search got lost somewhere. Small changes then lead to other places, so it is repeated with other
+    windows held out, and J decides.
 
     Parameters
     ----------
@@ -91,7 +91,7 @@ def match_drive(
     known : float64, shape (K, 3), optional
         Nodes of the trajectory from walls.
     start : float64, shape (K, 3), optional
-        Nodes from which matching starts if it recognises few places from those of scan matching.
+        Nodes from which matching starts if few blocks fit when it starts from those of scan matching.
     """
     best, value = None, scans.objective(scans.windows.node)
     if known is not None:
@@ -111,7 +111,7 @@ def match_drive(
         found = _match_repeatedly(odometry, scans, start_stage, make(), remaining, value)
         if found is not None:
             best, value = found, found.value
-        # if most places are recognised another trial hardly helps
+        # if most blocks fit, another trial hardly helps
         if best is not None and best.part >= LEAST_RECOGNISED:
             break
     for begin in OTHERS:
@@ -151,7 +151,7 @@ def _rounds(
         solver = MatchSolver(scans.windows, scans, start_stage, relative(nodes[:-1], nodes[1:]), noise, change)
         solution, loops = solver.with_matches(solution_at(nodes, len(CALIBRATION)))
         before, nodes = nodes, solution.nodes
-        found = MatchedDrive(nodes, loops, scans.objective(nodes), recognised_part(scans, nodes, loops), scans)
+        found = MatchedDrive(nodes, loops, scans.objective(nodes), fitting_part(scans, nodes, loops), scans)
         if found.value <= least:
             break
         best, least = found, found.value

@@ -17,9 +17,9 @@ from numpy.typing import NDArray
 from ..common.readings import Floats
 from .likelihood import Scan, scores
 from .local_map import LocalMap
-from .loops import APART, LENGTH, SHARED, Loop, Places, find_loop
+from .loops import APART, LENGTH, MEASURED, SHARED, Loop, Places, find_loop
 from .loops import REACH as LOOP_REACH
-from .matching import grid_around
+from .matching import climbed, grid_around, measure
 from .poses import compose, relative
 from .scans import FEWEST_ON_MAP, Scans
 
@@ -63,6 +63,10 @@ SIGMA = np.array([0.1, 0.1, math.radians(1.5)])
 LEAST_RECOGNISED = 0.85
 """Fraction of the blocks on an earlier visit that are recognised if the trajectory is not bent."""
 
+FITTING, STAYS = 0.5, np.array([0.3, 0.3, math.radians(6.0)])
+"""A block fits where it lies if its readings have more than this fraction of the usual score there, at the best pose
+nearby, which is at most so far away: metres, metres, radians. Few blocks fit by chance."""
+
 MORE_RECOGNISED = 2
 """This many more blocks must be recognised at another place."""
 
@@ -94,6 +98,38 @@ def recognised_part(scans: Scans, nodes: Floats, loops: Sequence[Loop]) -> float
     """Return the fraction of the blocks on an earlier visit that are recognised; 1 if there are none."""
     blocks = revisits(scans, nodes).tolist()
     return len(recognised(loops).intersection(blocks)) / len(blocks) if blocks else 1.0
+
+
+def fitting_part(scans: Scans, nodes: Floats, loops: Sequence[Loop]) -> float:
+    """Return the fraction of the blocks on an earlier visit that are recognised or fit where they lie; 1 if none do.
+
+    In a place that looks alike from two poses, a block is not recognised, and in one with small objects its readings
+    score less than elsewhere. So a block that is not recognised is no evidence of a wrong trajectory if it fits.
+    """
+    blocks, seen = revisits(scans, nodes), recognised(loops)
+    if not len(blocks):
+        return 1.0
+    usual = sum(loop.matches.score for loop in loops) / max(sum(loop.matches.readings for loop in loops), 1)
+    places = Places(scans, nodes)
+    fitting = [block in seen or _fits(scans, nodes, block, places, usual) for block in blocks.tolist()]
+    return sum(fitting) / len(fitting)
+
+
+def _fits(scans: Scans, nodes: Floats, number: int, places: Places, usual: float) -> bool:
+    """Return whether a block fits the map of the nearest earlier visit where it lies."""
+    block = windows_of(np.array([number]), len(nodes))
+    middle, progress = block[len(block) // 2], scans.windows.node_progress
+    before = np.arange(0, len(nodes), SHARED)
+    before = before[progress[before] < progress[middle] - APART]
+    place = int(before[np.hypot(*(nodes[before, :2] - nodes[middle, :2]).T).argmin()])
+    around, joint = places[place], scans.joint(block, relative(nodes[middle], nodes[block]))
+    if around is None or len(joint.readings) < FEWEST_ON_MAP or usual <= 0.0:
+        return False
+    pose = relative(nodes[place], nodes[middle])
+    best = climbed(joint, around, pose, MEASURED)
+    score = measure(joint, around, best, MEASURED).score
+    moved = np.abs(relative(pose, best))
+    return bool(score > FITTING * usual * len(joint.readings) and (moved <= STAYS).all())
 
 
 def confirmed_by_places(scans: Scans, nodes: Floats, loops: Sequence[Loop]) -> bool:

@@ -27,7 +27,7 @@ class Trials:
     Parameters
     ----------
     values : list of float, float
-        The share of recognised places of each round, and its J.
+        The part of the blocks that fit in each round, and its J.
     far : float
         Metres by which a round moves the nodes.
     others : tuple of int
@@ -43,7 +43,7 @@ class Trials:
         monkeypatch.setattr(any_angle, 'MatchSolver', self._solver)
         monkeypatch.setattr(any_angle, 'scan_matched', lambda scans, trust, watch: scans.windows.node)
         monkeypatch.setattr(Scans, 'objective', lambda *rest: values[len(self.calls) - 1][1] if self.calls else 0.0)
-        monkeypatch.setattr(any_angle, 'recognised_part', lambda *rest: values[len(self.calls) - 1][0])
+        monkeypatch.setattr(any_angle, 'fitting_part', lambda *rest: values[len(self.calls) - 1][0])
 
     def _solver(self, windows, scans, say, motion: Floats, noise: float, change) -> Trials:
         self.calls.append((motion, noise))
@@ -84,7 +84,7 @@ def test_map_of_the_whole_drive_is_made_once_for_the_same_nodes(scans, monkeypat
         ([(0.5, 1.0 + k) for k in range(2 * any_angle.ROUNDS)], any_angle.ROUNDS),
     ],
 )
-def test_rounds_continue_while_few_places_are_recognised_and_j_grows(
+def test_rounds_continue_while_few_blocks_fit_and_j_grows(
     bent, scans, monkeypatch, values: list[tuple[float, float]], rounds: int
 ) -> None:
     trials = Trials(monkeypatch, values)
@@ -128,7 +128,7 @@ def test_rounds_end_early_below_the_j_of_a_known_trajectory(bent, scans, monkeyp
 @pytest.mark.parametrize(
     ('values', 'begins', 'value'),
     [
-        # nothing more is tried if most places are recognised
+        # nothing more is tried if most blocks fit
         ([(0.9, 1.0)], [0.0], 1.0),
         ([(0.5, 1.0), (0.5, 0.5), (0.9, 3.0)], [0.0, 1.0, 5.0], 3.0),
         ([(0.5, 1.0), (0.5, 0.5), (0.5, 0.5), (0.9, 3.0)], [0.0, 1.0, 5.0, 0.0], 3.0),

@@ -11,7 +11,7 @@ import pytest
 from exact_tour import Tour, quietly, tour_with
 
 from forward_grid_mapper.core.common.readings import Floats
-from forward_grid_mapper.core.trajectory import hypotheses, solving
+from forward_grid_mapper.core.trajectory import hypotheses, relocating, solving
 from forward_grid_mapper.core.trajectory.doubts import DOUBTFUL, doubts, slight
 from forward_grid_mapper.core.trajectory.heading import Heading
 from forward_grid_mapper.core.trajectory.holding_out import LEAST_SIGMAS, Gain
@@ -19,7 +19,7 @@ from forward_grid_mapper.core.trajectory.hypotheses import MOST_DOUBTFUL, solve_
 from forward_grid_mapper.core.trajectory.judging import gain_at_revisits, gain_within_visits
 from forward_grid_mapper.core.trajectory.loops import APART, LENGTH, Loop
 from forward_grid_mapper.core.trajectory.matching import Match
-from forward_grid_mapper.core.trajectory.passes import Matches, match_preceding
+from forward_grid_mapper.core.trajectory.passes import Matches, match_preceding, match_surrounding
 from forward_grid_mapper.core.trajectory.pose_graph import solution_at
 from forward_grid_mapper.core.trajectory.poses import compose, relative
 from forward_grid_mapper.core.trajectory.relocating import (
@@ -27,10 +27,13 @@ from forward_grid_mapper.core.trajectory.relocating import (
     FEW,
     LEAST_RECOGNISED,
     RUN,
+    STAYS,
     confirmed,
     confirmed_by_places,
     displaced,
+    fitting_part,
     recognised,
+    recognised_part,
     revisits,
     unsupported,
     windows_of,
@@ -203,6 +206,43 @@ def test_doubtful_place_is_in_the_middle_of_a_drop_of_certainty() -> None:
     both = certain * little
     total = sum(p for _, p in (*doubts(at, both), *slight(at, both)))
     assert total == pytest.approx(1.0 - both[-1], abs=1e-9)
+
+
+def test_blocks_fit_along_the_right_trajectory_although_they_are_not_recognised(there_and_back) -> None:
+    scans, true = there_and_back.scans, there_and_back.windows.node
+    usual = match_surrounding(scans, true, lambda part: None)
+    one = [Loop(int(revisits(scans, true)[0]) * LENGTH + LENGTH // 2, 4, usual)]
+    assert recognised_part(scans, true, one) < 0.5
+    assert fitting_part(scans, true, one) >= LEAST_RECOGNISED
+
+
+def test_blocks_do_not_fit_along_a_wrong_trajectory(there_and_back) -> None:
+    scans, wrong, first = there_and_back.scans, astray(there_and_back), turning(there_and_back)
+    usual = match_surrounding(scans, there_and_back.windows.node, lambda part: None)
+    blocks = revisits(scans, wrong)
+    back = blocks[blocks * LENGTH > first]
+    assert len(back) >= RUN
+    # those of the way there lie right, and some of the way back fit by chance
+    assert fitting_part(scans, wrong, [Loop(4, 4, usual)]) <= 1.0 - 0.7 * len(back) / len(blocks)
+
+
+def test_block_whose_best_pose_lies_elsewhere_does_not_fit(there_and_back, monkeypatch) -> None:
+    scans, true = there_and_back.scans, there_and_back.windows.node
+    usual = match_surrounding(scans, true, lambda part: None)
+    for farther, fits in ((0.9, True), (1.1, False)):
+        moved = farther * STAYS * [1.0, 0.0, 0.0]
+        monkeypatch.setattr(relocating, 'climbed', lambda *rest, moved=moved: compose(rest[2], moved))
+        monkeypatch.setattr(relocating, 'measure', lambda *rest: Match(rest[2], np.eye(3), np.inf))
+        assert fitting_part(scans, true, [Loop(-LENGTH, -LENGTH, usual)]) == fits
+
+
+def test_all_blocks_fit_if_there_is_no_earlier_visit_and_none_if_nothing_is_recognised(there_and_back) -> None:
+    scans, true = there_and_back.scans, there_and_back.windows.node
+    before = true[: turning(there_and_back) // 4]
+    assert not len(revisits(scans, before))
+    assert fitting_part(scans, before, []) == 1.0
+    # without any match there is no usual score
+    assert fitting_part(scans, true, []) == 0.0
 
 
 @pytest.mark.parametrize('lost', [0, pytest.param(1, marks=pytest.mark.slow)])
