@@ -11,7 +11,8 @@ measured from. So the trajectory is scaled as a whole if J becomes clearly large
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from dataclasses import replace
 from functools import partial
 from typing import NamedTuple
 
@@ -136,20 +137,32 @@ def _match_repeatedly(
     scaled = _scaled(scans, found.nodes, found.value)
     if scaled is found.nodes:
         return found
+    size, before = (np.linalg.norm(nodes[:, :2] - nodes[0, :2]) for nodes in (scaled, found.nodes))
+    loops = [replace(loop, matches=loop.matches.scaled(float(size / before))) for loop in found.loops]
     found = found._replace(nodes=scaled, value=scans.objective(scaled))
     # otherwise matches would take back some of it
     change[:, :, CALIBRATION.index('scale')] = 0.0
-    return _rounds(scans, start_stage, scaled, noise, change, found.value) or found
+    return _rounds(scans, start_stage, scaled, noise, change, found.value, loops) or found
 
 
 def _rounds(
-    scans: Scans, start_stage: Callable[[str], Progress], start: Floats, noise: float, change: Floats, least: float
+    scans: Scans,
+    start_stage: Callable[[str], Progress],
+    start: Floats,
+    noise: float,
+    change: Floats,
+    least: float,
+    found_before: Sequence[Loop] = (),
 ) -> MatchedDrive | None:
-    """Return the best of some rounds of matching, each from the result before; None if J is at most `least`."""
+    """Return the best of some rounds of matching, each from the result before; None if J is at most `least`.
+
+    With loop closures that were found before, the first round searches only near the poses that these give.
+    """
     nodes, best = start, None
     for _ in range(ROUNDS):
         solver = MatchSolver(scans.windows, scans, start_stage, relative(nodes[:-1], nodes[1:]), noise, change)
-        solution, loops = solver.with_matches(solution_at(nodes, len(CALIBRATION)))
+        solution, loops = solver.with_matches(solution_at(nodes, len(CALIBRATION)), found_before)
+        found_before = ()
         before, nodes = nodes, solution.nodes
         found = MatchedDrive(nodes, loops, scans.objective(nodes), fitting_part(scans, nodes, loops), scans)
         if found.value <= least:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from copy import copy
 from functools import partial
 
 import numpy as np
@@ -64,6 +65,12 @@ class Matches:
     def mean_score(self) -> float:
         """The mean log-likelihood ratio of a reading, nats."""
         return self.score / max(self.readings, 1)
+
+    def scaled(self, factor: float) -> Matches:
+        """Return the matches with distances multiplied by a factor."""
+        out, scale = copy(self), np.array([factor, factor, 1.0])
+        out._rows = [(place, window, scale * pose, information) for place, window, pose, information in self._rows]
+        return out
 
     def edges(self) -> Edges:
         """Return the matches as edges of the pose graph."""

@@ -7,7 +7,7 @@ are accurate to some centimetres over some metres, and local maps are sharp.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -97,15 +97,19 @@ class MatchSolver:
         self._steps = Edges(count[:-1], count[1:], motion, information)
         self._yaws = no_yaws()
 
-    def with_matches(self, solution: Solution) -> tuple[Solution, list[Loop]]:
-        """Return the solution with matches and loop closures, starting from `solution`, and the loop closures."""
+    def with_matches(self, solution: Solution, found_before: Sequence[Loop] = ()) -> tuple[Solution, list[Loop]]:
+        """Return the solution with matches and loop closures, starting from `solution`, and the loop closures.
+
+        With those that were found before, the first searches are only as wide as these leave it.
+        """
         known, loops = SearchResults(), list[Loop]()
         for match, stage in ((match_preceding, 'matching'), (match_surrounding, 'matching again')):
             before = solution.nodes
             found = match(self._scans, solution.nodes, self._start_stage(stage))
             edges = _edges_of(found)
             walls = self._walls(solution.nodes, True)
-            both = joined(edges, *(_edges_of(loop.matches) for loop in loops_of(known)))
+            both = joined(edges, *(_edges_of(loop.matches) for loop in (*found_before, *loops_of(known))))
+            found_before = ()
             solution = solve(self._graph(both, walls), solution.nodes, solution.calibration, SAMPLES)
             watch, searched = self._start_stage('places seen before'), solution.nodes
             results = find_loops(self._scans, searched, solution.samples, found.mean_score, watch, known)

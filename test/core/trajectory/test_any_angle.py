@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 import numpy as np
 import pytest
@@ -13,7 +14,10 @@ from forward_grid_mapper.core.common.readings import Floats
 from forward_grid_mapper.core.trajectory import any_angle, scan_matching
 from forward_grid_mapper.core.trajectory import scans as scans_module
 from forward_grid_mapper.core.trajectory.holding_out import Gain, held_out
+from forward_grid_mapper.core.trajectory.loops import Loop
+from forward_grid_mapper.core.trajectory.matching import Match
 from forward_grid_mapper.core.trajectory.odometry_model import CALIBRATION
+from forward_grid_mapper.core.trajectory.passes import Matches
 from forward_grid_mapper.core.trajectory.pose_graph import Solution, solution_at
 from forward_grid_mapper.core.trajectory.poses import relative
 from forward_grid_mapper.core.trajectory.scan_matching import TRUSTS, Trust
@@ -40,6 +44,8 @@ class Trials:
         monkeypatch.setattr(any_angle, 'OTHERS', others)
         self.calls: list[tuple[Floats, float]] = []
         self._far = far
+        self.loops: list[Loop] = []
+        self.found_before: list[Sequence[Loop]] = []
         monkeypatch.setattr(any_angle, 'MatchSolver', self._solver)
         monkeypatch.setattr(any_angle, 'scan_matched', lambda scans, trust, watch: scans.windows.node)
         monkeypatch.setattr(Scans, 'objective', lambda *rest: values[len(self.calls) - 1][1] if self.calls else 0.0)
@@ -50,11 +56,12 @@ class Trials:
         self.change = change
         return self
 
-    def with_matches(self, solution: Solution) -> tuple[Solution, list]:
+    def with_matches(self, solution: Solution, found_before: Sequence[Loop] = ()) -> tuple[Solution, list[Loop]]:
+        self.found_before.append(found_before)
         nodes = solution.nodes.copy()
         np.testing.assert_array_equal(self.calls[-1][0], relative(nodes[:-1], nodes[1:]))
         nodes[len(nodes) // 2 :, 0] += self._far
-        return solution_at(nodes, 4), []
+        return solution_at(nodes, 4), self.loops
 
 
 def test_map_of_the_whole_drive_is_made_once_for_the_same_nodes(scans, monkeypatch) -> None:
@@ -144,9 +151,9 @@ def test_given_nodes_are_another_start(
     trials, solve, seen = Trials(monkeypatch, values), Trials.with_matches, list[float]()
     start = scans.windows.node + np.array([5.0, 0.0, 0.0])
 
-    def with_matches(trial: Trials, solution: Solution) -> tuple[Solution, list]:
+    def with_matches(trial: Trials, solution: Solution, found_before: Sequence[Loop]) -> tuple[Solution, list[Loop]]:
         seen.append(solution.nodes[-1, 0] - scans.windows.node[-1, 0])
-        return solve(trial, solution)
+        return solve(trial, solution, found_before)
 
     monkeypatch.setattr(Trials, 'with_matches', with_matches)
     found = any_angle.match_drive(bent[1], scans, lambda stage: quietly, start=start)
@@ -265,3 +272,22 @@ def test_next_round_holds_the_scale_that_was_found(bent, scans, monkeypatch) -> 
     assert found.nodes == pytest.approx(larger)
     assert not trials.change[:, :, CALIBRATION.index('scale')].any()
     assert trials.change[:, :, CALIBRATION.index('bias')].any()
+
+
+def test_first_round_at_another_scale_searches_near_the_loop_closures_before(bent, scans, monkeypatch) -> None:
+    trials = Trials(monkeypatch, [(0.9, 1.0), (0.5, 2.0), (0.9, 3.0)])
+    matches = Matches()
+    matches.add(3, 40, Match(np.array([0.5, -0.2, 0.1]), np.eye(3), 30.0), 20)
+    trials.loops = [Loop(40, 3, matches)]
+
+    def scaled(scans: Scans, nodes: Floats, value: float) -> Floats:
+        out = nodes.copy()
+        out[:, :2] = nodes[0, :2] + 1.05 * (nodes[:, :2] - nodes[0, :2])
+        return out
+
+    monkeypatch.setattr(any_angle, '_scaled', scaled)
+    found = any_angle.match_drive(bent[1], scans, lambda stage: quietly)
+    assert found is not None
+    assert [len(loops) for loops in trials.found_before] == [0, 1, 0]
+    assert trials.found_before[1][0].matches.edges().pose[0] == pytest.approx([0.525, -0.21, 0.1])
+    assert matches.edges().pose[0] == pytest.approx([0.5, -0.2, 0.1])

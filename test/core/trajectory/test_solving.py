@@ -10,10 +10,16 @@ import pytest
 from exact_tour import Tour, quietly, tour_with
 
 from forward_grid_mapper.core.common.readings import Floats
+from forward_grid_mapper.core.trajectory import solving
 from forward_grid_mapper.core.trajectory.heading import Heading
-from forward_grid_mapper.core.trajectory.poses import wrapped
+from forward_grid_mapper.core.trajectory.loops import Loop, SearchResults
+from forward_grid_mapper.core.trajectory.matching import Match
+from forward_grid_mapper.core.trajectory.odometry_model import CALIBRATION, motions, sensitivity
+from forward_grid_mapper.core.trajectory.passes import Matches
+from forward_grid_mapper.core.trajectory.pose_graph import solution_at
+from forward_grid_mapper.core.trajectory.poses import relative, wrapped
 from forward_grid_mapper.core.trajectory.scans import Scans
-from forward_grid_mapper.core.trajectory.solving import YAW_WEIGHT, Solver
+from forward_grid_mapper.core.trajectory.solving import YAW_WEIGHT, MatchSolver, Solver
 from forward_grid_mapper.core.trajectory.walls import SPAN
 from forward_grid_mapper.core.trajectory.windows import Odometry, Windows
 from forward_grid_mapper.simulation.sonar import front_array
@@ -31,6 +37,26 @@ def exact() -> Tour:
 def solver_of(exact: tuple[Odometry, Windows, Scans, Heading], heading_of_walls: Heading) -> Solver:
     odometry, windows, scans, _ = exact
     return Solver(odometry, windows, scans, heading_of_walls, quietly)
+
+
+@pytest.mark.parametrize('known', [False, True])
+def test_only_the_first_search_is_as_wide_as_loop_closures_from_before_leave_it(exact, monkeypatch, known) -> None:
+    """Later searches are as wide as those that were found leave it."""
+    odometry, windows, scans, _ = exact
+    solver = MatchSolver(windows, scans, quietly, motions(odometry, windows), 0.1, sensitivity(odometry, windows))
+    nodes, last, spreads = windows.node, len(windows) - 1, list[float]()
+    matches = Matches()
+    matches.add(0, last, Match(relative(nodes[0], nodes[last]), 1e6 * np.eye(3), 30.0), 20)
+
+    def find_loops(scans: Scans, nodes: Floats, samples: Floats, *rest: object) -> SearchResults:
+        spreads.append(float(samples[:, last, :2].std()))
+        return {}
+
+    monkeypatch.setattr(solving, 'find_loops', find_loops)
+    monkeypatch.setattr(solving, 'SETTLED', 0.0)
+    solver.with_matches(solution_at(nodes, len(CALIBRATION)), [Loop(last, 0, matches)] if known else [])
+    assert (spreads[0] < 0.01) == known
+    assert spreads[1] > 0.02
 
 
 def turned(windows: Windows, nodes: Floats) -> Floats:
