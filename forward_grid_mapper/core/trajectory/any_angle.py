@@ -1,6 +1,6 @@
 """The trajectory from matching alone, for walls at any angle: scan matching, then matches of blocks and loop closures.
 
-A bent trajectory has bent local maps, and few places are recognised on them. So blocks are matched and loops are closed
+A bent trajectory has bent local maps, and few blocks fit them. So blocks are matched and loops are closed
 again with the result in place of odometry, as long as J of the map of the whole drive grows.
 
 Local maps are scaled as the trajectory is, so matches confirm a wrong scale of the wheels. The map of the whole drive
@@ -20,6 +20,7 @@ import numpy as np
 
 from ..common.errors import InputError
 from ..common.readings import Floats
+from .fitting import fitted
 from .holding_out import LEAST_SIGMAS, OTHERS, held_out
 from .judging import gain_of_objective
 from .loops import Loop
@@ -27,7 +28,7 @@ from .odometry_model import CALIBRATION, sensitivity
 from .passes import Progress
 from .pose_graph import solution_at
 from .poses import relative, rms_after_alignment
-from .relocating import LEAST_RECOGNISED, fitting_part
+from .relocating import LEAST_RECOGNISED, fitting_part, recognised_part
 from .scan_matching import TRUSTS, Trust, scan_matched
 from .scans import Scans
 from .solving import SETTLED, MatchSolver
@@ -42,6 +43,9 @@ ROUNDS = 4
 SCALE_STEP, LEAST_STEPS, MOST_STEPS = 1.03, 0.5, 5
 """Factor from one scale to the next that is tried after the rounds, fewest steps by which the scale is changed, since J
 is noisy, and number of steps at which the search ends without a result."""
+
+WORTH_FITTING = 1.0
+"""Standard errors by which J must be larger at another scale for both trajectories to be fitted."""
 
 
 class MatchedDrive(NamedTuple):
@@ -134,15 +138,13 @@ def _match_repeatedly(
     found = _rounds(scans, start_stage, start, noise, change, least)
     if found is None:
         return None
-    scaled = _scaled(scans, found.nodes, found.value)
-    if scaled is found.nodes:
+    scaled = _scaled(scans, found, start_stage('scale'))
+    if scaled is found:
         return found
-    size, before = (np.linalg.norm(nodes[:, :2] - nodes[0, :2]) for nodes in (scaled, found.nodes))
-    loops = [replace(loop, matches=loop.matches.scaled(float(size / before))) for loop in found.loops]
-    found = found._replace(nodes=scaled, value=scans.objective(scaled))
-    # otherwise matches would take back some of it
+    # otherwise matches would take back more of it
     change[:, :, CALIBRATION.index('scale')] = 0.0
-    return _rounds(scans, start_stage, scaled, noise, change, found.value, loops) or found
+    found = _rounds(scans, start_stage, scaled.nodes, noise, change, scaled.value, scaled.loops) or scaled
+    return _scaled(scans, found, start_stage('scale'))
 
 
 def _rounds(
@@ -162,22 +164,28 @@ def _rounds(
     for _ in range(ROUNDS):
         solver = MatchSolver(scans.windows, scans, start_stage, relative(nodes[:-1], nodes[1:]), noise, change)
         solution, loops = solver.with_matches(solution_at(nodes, len(CALIBRATION)), found_before)
-        found_before = ()
-        before, nodes = nodes, solution.nodes
-        found = MatchedDrive(nodes, loops, scans.objective(nodes), fitting_part(scans, nodes, loops), scans)
-        if found.value <= least:
+        before, nodes, found_before = nodes, solution.nodes, ()
+        value = scans.objective(nodes)
+        if value <= least:
             break
-        best, least = found, found.value
-        if found.part >= LEAST_RECOGNISED or rms_after_alignment(before, nodes) < SETTLED:
+        best, least, usual = MatchedDrive(nodes, loops, value, 0.0, scans), value, solver.usual
+        settled = rms_after_alignment(before, nodes) < SETTLED
+        # blocks that are not recognised may fit a map that is still bent
+        if settled or recognised_part(scans, nodes, loops) >= LEAST_RECOGNISED:
             break
-    return best
+    if best is None:
+        return None
+    part = fitting_part(scans, best.nodes, best.loops, usual, start_stage('places seen before'))
+    return best._replace(part=part)
 
 
-def _scaled(scans: Scans, nodes: Floats, value: float) -> Floats:
-    """Return the trajectory at the scale of the largest J if that is clearly larger than `value`, otherwise `nodes`.
+def _scaled(scans: Scans, found: MatchedDrive, watch: Progress) -> MatchedDrive:
+    """Return the drive at the scale of the largest J if that is clearly larger, otherwise `found` itself.
 
-    `value` is J of `nodes`, nats.
+    If it may be, both are fitted to their own maps first, since a trajectory that was matched at one scale does not fit
+    the map at another.
     """
+    nodes = found.nodes
 
     def at(steps: float) -> Floats:
         out = nodes.copy()
@@ -191,18 +199,30 @@ def _scaled(scans: Scans, nodes: Floats, value: float) -> Floats:
             # the map of a larger trajectory may be too large
             return -math.inf
 
-    values = {0: value, **{step: objective(step) for step in (-1, 1)}}
+    values = {0: found.value, **{step: objective(step) for step in (-1, 1)}}
     top = max(values, key=values.__getitem__)
     while top in (min(values), max(values)) and abs(top) < MOST_STEPS:
         beyond = top + int(np.sign(top))
         values[beyond] = objective(beyond)
         top = max(values, key=values.__getitem__)
     if top in (min(values), max(values)):
-        return nodes
+        return found
     before, here, after = (values[top + step] for step in (-1, 0, 1))
     curvature = 2.0 * here - before - after
     steps = top + 0.5 * (after - before) / curvature if 0.0 < curvature < math.inf else top
     if abs(steps) < LEAST_STEPS:
-        return nodes
+        return found
     scaled = at(steps)
-    return scaled if gain_of_objective(scans, nodes, scaled).sigmas >= LEAST_SIGMAS else nodes
+    better = gain_of_objective(scans, nodes, scaled).sigmas
+    if WORTH_FITTING <= better < LEAST_SIGMAS:
+        first, scaled = fitted(scans, nodes, watch), fitted(scans, scaled, watch)
+        try:
+            better = gain_of_objective(scans, first, scaled).sigmas
+        except InputError:
+            # fitted trajectories may be some cells larger
+            return found
+    if better < LEAST_SIGMAS:
+        return found
+    # places lie in the frames of nodes, which are farther apart by the same factor
+    loops = [replace(loop, matches=loop.matches.scaled(SCALE_STEP**steps)) for loop in found.loops]
+    return found._replace(nodes=scaled, loops=loops, value=scans.objective(scaled))

@@ -291,7 +291,7 @@ def _bend_words(part: float) -> str:
     """Return the warning about the fraction of blocks that fit the map of earlier visits; empty if it is large."""
     if part >= LEAST_RECOGNISED:
         return ''
-    return f'; only {part:.0%} of the path through places seen before fits them: the drive may be bent as a whole'
+    return f'; only {part:.0%} of the path through places seen before fits their maps: the drive may be bent as a whole'
 
 
 def _report_part(watch: Watch, name: str, stage: str, part: float) -> None:

@@ -10,16 +10,19 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..common.readings import Floats
+from ..runtime.threads import in_order
 from .likelihood import Scan, scores
 from .local_map import LocalMap
 from .loops import APART, LENGTH, MEASURED, SHARED, Loop, Places, find_loop
 from .loops import REACH as LOOP_REACH
 from .matching import climbed, grid_around, measure
+from .passes import Progress
 from .poses import compose, relative
 from .scans import FEWEST_ON_MAP, Scans
 
@@ -61,11 +64,11 @@ SIGMA = np.array([0.1, 0.1, math.radians(1.5)])
 """σ of the pose of a block after its stretch was moved: metres, metres, radians."""
 
 LEAST_RECOGNISED = 0.85
-"""Fraction of the blocks on an earlier visit that are recognised if the trajectory is not bent."""
+"""Fraction of the blocks on an earlier visit that are recognised, or fit, if the trajectory is not bent."""
 
-FITTING, STAYS = 0.5, np.array([0.3, 0.3, math.radians(6.0)])
-"""A block fits where it lies if its readings have more than this fraction of the usual score there, at the best pose
-nearby, which is at most so far away: metres, metres, radians. Few blocks fit by chance."""
+FITTING, STAYS = 0.5, np.array([0.2, 0.2, math.radians(4.0)])
+"""A block fits where it lies if its readings have more than this fraction of the usual score at the nearest maximum,
+and if this is at most so far away: metres, metres, radians."""
 
 MORE_RECOGNISED = 2
 """This many more blocks must be recognised at another place."""
@@ -82,15 +85,15 @@ def revisits(scans: Scans, nodes: Floats, passed: int | None = None) -> NDArray[
     With `passed`, only blocks after this node that lie on a visit before it.
     """
     progress, out = scans.windows.node_progress, []
-    for first in range(0, len(nodes) - LENGTH // 2, LENGTH):
-        middle = min(first + LENGTH // 2, len(nodes) - 1)
+    for number in range(-(-(len(nodes) - LENGTH // 2) // LENGTH)):
+        middle = _middle(number, nodes)
         if passed is not None and middle < passed:
             continue
         # progress increases, so earlier nodes are the first ones
         until = int(np.searchsorted(progress, progress[middle] - APART))
         before = nodes[: until if passed is None else min(until, passed), :2]
         if len(before) and np.hypot(*(before - nodes[middle, :2]).T).min() < NEAR:
-            out.append(first // LENGTH)
+            out.append(number)
     return np.array(out, np.int64)
 
 
@@ -100,36 +103,55 @@ def recognised_part(scans: Scans, nodes: Floats, loops: Sequence[Loop]) -> float
     return len(recognised(loops).intersection(blocks)) / len(blocks) if blocks else 1.0
 
 
-def fitting_part(scans: Scans, nodes: Floats, loops: Sequence[Loop]) -> float:
-    """Return the fraction of the blocks on an earlier visit that are recognised or fit where they lie; 1 if none do.
+def fitting_part(scans: Scans, nodes: Floats, loops: Sequence[Loop], usual: float, watch: Progress) -> float:
+    """Return the fraction of the blocks on an earlier visit that are recognised or fit where they lie.
+
+    It is 1 if there are no such blocks.
 
     In a place that looks alike from two poses, a block is not recognised, and in one with small objects its readings
     score less than elsewhere. So a block that is not recognised is no evidence of a wrong trajectory if it fits.
+
+    Parameters
+    ----------
+    scans : Scans
+    nodes : float64, shape (K, 3)
+    loops : sequence of Loop
+    usual : float
+        Usual log-likelihood ratio of a reading, nats.
+    watch : callable
+        Receives the fraction of the work that is done.
     """
-    blocks, seen = revisits(scans, nodes), recognised(loops)
-    if not len(blocks):
+    blocks, seen, places = revisits(scans, nodes).tolist(), recognised(loops), Places(scans, nodes)
+    work = [partial(_fits, scans, nodes, block, places, usual) for block in blocks if block not in seen]
+    if not blocks:
         return 1.0
-    usual = sum(loop.matches.score for loop in loops) / max(sum(loop.matches.readings for loop in loops), 1)
-    places = Places(scans, nodes)
-    fitting = [block in seen or _fits(scans, nodes, block, places, usual) for block in blocks.tolist()]
-    return sum(fitting) / len(fitting)
+    fitting = len(blocks) - len(work)
+    for done, fits in enumerate(in_order(work, scans.threads)):
+        watch(done / len(work))
+        fitting += fits
+    return fitting / len(blocks)
 
 
 def _fits(scans: Scans, nodes: Floats, number: int, places: Places, usual: float) -> bool:
     """Return whether a block fits the map of the nearest earlier visit where it lies."""
-    block = windows_of(np.array([number]), len(nodes))
-    middle, progress = block[len(block) // 2], scans.windows.node_progress
-    before = np.arange(0, len(nodes), SHARED)
+    block, middle = windows_of(np.array([number]), len(nodes)), _middle(number, nodes)
+    before, progress = np.arange(0, len(nodes), SHARED), scans.windows.node_progress
     before = before[progress[before] < progress[middle] - APART]
-    place = int(before[np.hypot(*(nodes[before, :2] - nodes[middle, :2]).T).argmin()])
-    around, joint = places[place], scans.joint(block, relative(nodes[middle], nodes[block]))
-    if around is None or len(joint.readings) < FEWEST_ON_MAP or usual <= 0.0:
+    if scans.count[block].sum() < FEWEST_ON_MAP or usual <= 0.0:
         return False
-    pose = relative(nodes[place], nodes[middle])
+    place = int(before[np.hypot(*(nodes[before, :2] - nodes[middle, :2]).T).argmin()])
+    around = places[place]
+    if around is None:
+        return False
+    joint, pose = scans.joint(block, relative(nodes[middle], nodes[block])), relative(nodes[place], nodes[middle])
     best = climbed(joint, around, pose, MEASURED)
     score = measure(joint, around, best, MEASURED).score
-    moved = np.abs(relative(pose, best))
-    return bool(score > FITTING * usual * len(joint.readings) and (moved <= STAYS).all())
+    return bool(score > FITTING * usual * len(joint.readings) and (np.abs(relative(pose, best)) <= STAYS).all())
+
+
+def _middle(number: int, nodes: Floats) -> int:
+    """Return the node in the middle of a block."""
+    return min(number * LENGTH + LENGTH // 2, len(nodes) - 1)
 
 
 def confirmed_by_places(scans: Scans, nodes: Floats, loops: Sequence[Loop]) -> bool:

@@ -79,6 +79,11 @@ class MatchSolver:
         σ of its yaw, radians a √metre.
     change : float64, shape (K − 1, 3, C)
         Derivative of `motion` with respect to the calibration.
+
+    Attributes
+    ----------
+    usual : float
+        Mean log-likelihood ratio of a reading in the last matches with local maps, nats.
     """
 
     def __init__(
@@ -95,18 +100,19 @@ class MatchSolver:
         information = np.asarray(np.linalg.inv(covariances(windows, Noise(yaw=noise))), np.float64)
         count = np.arange(len(windows))
         self._steps = Edges(count[:-1], count[1:], motion, information)
-        self._yaws = no_yaws()
+        self._yaws, self.usual = no_yaws(), 0.0
 
     def with_matches(self, solution: Solution, found_before: Sequence[Loop] = ()) -> tuple[Solution, list[Loop]]:
         """Return the solution with matches and loop closures, starting from `solution`, and the loop closures.
 
-        With those that were found before, the first searches are only as wide as these leave it.
+        `found_before` are loop closures of an earlier solution. They make the first search narrower, and are no part of
+        the result.
         """
         known, loops = SearchResults(), list[Loop]()
         for match, stage in ((match_preceding, 'matching'), (match_surrounding, 'matching again')):
             before = solution.nodes
             found = match(self._scans, solution.nodes, self._start_stage(stage))
-            edges = _edges_of(found)
+            edges, self.usual = _edges_of(found), found.mean_score
             walls = self._walls(solution.nodes, True)
             both = joined(edges, *(_edges_of(loop.matches) for loop in (*found_before, *loops_of(known))))
             found_before = ()

@@ -13,11 +13,12 @@ from forward_grid_mapper.core.common.errors import InputError
 from forward_grid_mapper.core.common.readings import Floats
 from forward_grid_mapper.core.trajectory import any_angle, scan_matching
 from forward_grid_mapper.core.trajectory import scans as scans_module
+from forward_grid_mapper.core.trajectory.any_angle import MatchedDrive
 from forward_grid_mapper.core.trajectory.holding_out import Gain, held_out
 from forward_grid_mapper.core.trajectory.loops import Loop
 from forward_grid_mapper.core.trajectory.matching import Match
 from forward_grid_mapper.core.trajectory.odometry_model import CALIBRATION
-from forward_grid_mapper.core.trajectory.passes import Matches
+from forward_grid_mapper.core.trajectory.passes import Matches, Progress
 from forward_grid_mapper.core.trajectory.pose_graph import Solution, solution_at
 from forward_grid_mapper.core.trajectory.poses import relative
 from forward_grid_mapper.core.trajectory.scan_matching import TRUSTS, Trust
@@ -31,7 +32,7 @@ class Trials:
     Parameters
     ----------
     values : list of float, float
-        The part of the blocks that fit in each round, and its J.
+        The part of the blocks that are recognised, or fit, in each round, and its J.
     far : float
         Metres by which a round moves the nodes.
     others : tuple of int
@@ -43,13 +44,17 @@ class Trials:
     ) -> None:
         monkeypatch.setattr(any_angle, 'OTHERS', others)
         self.calls: list[tuple[Floats, float]] = []
+        self.usual = 1.0
         self._far = far
         self.loops: list[Loop] = []
         self.found_before: list[Sequence[Loop]] = []
         monkeypatch.setattr(any_angle, 'MatchSolver', self._solver)
         monkeypatch.setattr(any_angle, 'scan_matched', lambda scans, trust, watch: scans.windows.node)
         monkeypatch.setattr(Scans, 'objective', lambda *rest: values[len(self.calls) - 1][1] if self.calls else 0.0)
-        monkeypatch.setattr(any_angle, 'fitting_part', lambda *rest: values[len(self.calls) - 1][0])
+        self._parts = [part for part, _ in values]
+        self.part_of: dict[bytes, float] = {}
+        for name in ('fitting_part', 'recognised_part'):
+            monkeypatch.setattr(any_angle, name, lambda scans, nodes, *rest: self.part_of[nodes.tobytes()])
 
     def _solver(self, windows, scans, say, motion: Floats, noise: float, change) -> Trials:
         self.calls.append((motion, noise))
@@ -61,6 +66,7 @@ class Trials:
         nodes = solution.nodes.copy()
         np.testing.assert_array_equal(self.calls[-1][0], relative(nodes[:-1], nodes[1:]))
         nodes[len(nodes) // 2 :, 0] += self._far
+        self.part_of[nodes.tobytes()] = self._parts[len(self.calls) - 1]
         return solution_at(nodes, 4), self.loops
 
 
@@ -91,7 +97,7 @@ def test_map_of_the_whole_drive_is_made_once_for_the_same_nodes(scans, monkeypat
         ([(0.5, 1.0 + k) for k in range(2 * any_angle.ROUNDS)], any_angle.ROUNDS),
     ],
 )
-def test_rounds_continue_while_few_blocks_fit_and_j_grows(
+def test_rounds_continue_while_few_places_are_recognised_and_j_grows(
     bent, scans, monkeypatch, values: list[tuple[float, float]], rounds: int
 ) -> None:
     trials = Trials(monkeypatch, values)
@@ -196,11 +202,19 @@ def test_search_that_got_lost_is_repeated_with_other_windows_held_out(
         )
 
 
+def scaled_from(scans: Scans, nodes: Floats, loops: Sequence[Loop] = ()) -> MatchedDrive:
+    """Return the drive at the best scale, and the same object if this is the one that it has."""
+    found = MatchedDrive(nodes, [*loops], scans.objective(nodes), 1.0, scans)
+    return any_angle._scaled(scans, found, lambda part: None)
+
+
 @pytest.mark.parametrize('factor', [0.9, 1.1])
 def test_wrong_scale_of_a_drive_is_found_by_its_objective(exact, scans, factor: float) -> None:
     true = odometry_of(exact).at(scans.windows.node_stamp)
     wrong = np.column_stack([factor * true[:, :2], true[:, 2]])
-    found = any_angle._scaled(scans, wrong, scans.objective(wrong))
+    moved = scaled_from(scans, wrong)
+    found = moved.nodes
+    assert moved.value == scans.objective(found)
     scale = np.hypot(*(found[-1, :2] - found[0, :2])) / np.hypot(*(true[-1, :2] - true[0, :2]))
     assert scale == pytest.approx(1.0, abs=0.02)
     assert np.array_equal(found[0], wrong[0])
@@ -209,23 +223,30 @@ def test_wrong_scale_of_a_drive_is_found_by_its_objective(exact, scans, factor: 
 
 def test_right_scale_of_a_drive_is_kept(exact, scans) -> None:
     true = odometry_of(exact).at(scans.windows.node_stamp)
-    assert any_angle._scaled(scans, true, scans.objective(true)) is true
+    assert scaled_from(scans, true).nodes is true
 
 
 class Scaled:
     """A drive whose J is a parabola of the logarithm of its scale."""
 
-    def __init__(self, monkeypatch, best: float, sigmas: float) -> None:
+    def __init__(self, monkeypatch, best: float, *sigmas: float) -> None:
         self.nodes = np.array([[1.0, 2.0, 0.3], [4.0, 6.0, 0.5]])
         self._best = best
-        monkeypatch.setattr(any_angle, 'gain_of_objective', lambda *rest: Gain(sigmas, 1.0))
+        gains, self.fitted = iter([*sigmas, sigmas[-1]]), list[Floats]()
+        monkeypatch.setattr(any_angle, 'gain_of_objective', lambda *rest: Gain(next(gains), 1.0))
+
+        def fitted(scans: Scans, nodes: Floats, watch: Progress) -> Floats:
+            self.fitted.append(nodes)
+            return nodes + np.array([0.0, 0.0, 0.1])
+
+        monkeypatch.setattr(any_angle, 'fitted', fitted)
 
     def objective(self, nodes: Floats) -> float:
         scale = np.hypot(*(nodes[1] - nodes[0])[:2]) / 5.0
         return -100.0 * (math.log(scale / self._best) / math.log(any_angle.SCALE_STEP)) ** 2
 
     def scale(self) -> float:
-        found = any_angle._scaled(self, self.nodes, self.objective(self.nodes))  # type: ignore[arg-type]
+        found = scaled_from(self, self.nodes).nodes  # type: ignore[arg-type]
         return float(np.hypot(*(found[1] - found[0])[:2])) / 5.0
 
 
@@ -247,6 +268,29 @@ def test_scale_is_the_top_of_the_objective_if_that_is_clear(
     assert Scaled(monkeypatch, best, sigmas).scale() == pytest.approx(scale)
 
 
+@pytest.mark.parametrize(('sigmas', 'scale'), [((0.9, 3.0), 1.0), ((2.2, 2.2), 1.0), ((1.0, 2.3), 1.07)])
+def test_both_are_fitted_if_the_scale_may_be_wrong(monkeypatch, sigmas: tuple[float, ...], scale: float) -> None:
+    drive = Scaled(monkeypatch, 1.07, *sigmas)
+    assert drive.scale() == pytest.approx(scale)
+    assert len(drive.fitted) == (0 if sigmas[0] < any_angle.WORTH_FITTING else 2)
+    if drive.fitted:
+        sizes = [np.hypot(*(nodes[1] - nodes[0])[:2]) / 5.0 for nodes in drive.fitted]
+        assert sizes == pytest.approx([1.0, 1.07])
+
+
+def test_scale_is_kept_if_the_map_of_a_fitted_trajectory_would_be_too_large(monkeypatch) -> None:
+    drive = Scaled(monkeypatch, 1.07, 2.0)
+
+    def gain_of_objective(scans: Scans, before: Floats, after: Floats) -> Gain:
+        if drive.fitted:
+            raise InputError('the map would be too large')
+        return Gain(2.0, 1.0)
+
+    monkeypatch.setattr(any_angle, 'gain_of_objective', gain_of_objective)
+    assert drive.scale() == 1.0
+    assert drive.fitted
+
+
 def test_scale_whose_map_would_be_too_large_is_not_taken(exact, scans, monkeypatch) -> None:
     true = odometry_of(exact).at(scans.windows.node_stamp)
     wrong, objective = np.column_stack([0.9 * true[:, :2], true[:, 2]]), Scans.objective
@@ -258,14 +302,18 @@ def test_scale_whose_map_would_be_too_large_is_not_taken(exact, scans, monkeypat
         return objective(s, nodes)
 
     monkeypatch.setattr(Scans, 'objective', limited)
-    found = any_angle._scaled(scans, wrong, objective(scans, wrong))
+    found = scaled_from(scans, wrong).nodes
     assert np.ptp(found[:, 0]) == pytest.approx(np.ptp(wrong[:, 0]) * any_angle.SCALE_STEP)
 
 
 def test_next_round_holds_the_scale_that_was_found(bent, scans, monkeypatch) -> None:
     trials = Trials(monkeypatch, [(0.9, 1.0), (0.9, 2.0)], far=0.0)
     larger = scans.windows.node * [1.05, 1.05, 1.0]
-    monkeypatch.setattr(any_angle, '_scaled', lambda _, nodes, value: larger if len(trials.calls) == 1 else nodes)
+
+    def scaled(scans: Scans, found: MatchedDrive, watch: Progress) -> MatchedDrive:
+        return found._replace(nodes=larger) if len(trials.calls) == 1 else found
+
+    monkeypatch.setattr(any_angle, '_scaled', scaled)
     found = any_angle.match_drive(bent[1], scans, lambda stage: quietly)
     assert found is not None
     assert len(trials.calls) == 2
@@ -276,18 +324,27 @@ def test_next_round_holds_the_scale_that_was_found(bent, scans, monkeypatch) -> 
 
 def test_first_round_at_another_scale_searches_near_the_loop_closures_before(bent, scans, monkeypatch) -> None:
     trials = Trials(monkeypatch, [(0.9, 1.0), (0.5, 2.0), (0.9, 3.0)])
-    matches = Matches()
-    matches.add(3, 40, Match(np.array([0.5, -0.2, 0.1]), np.eye(3), 30.0), 20)
-    trials.loops = [Loop(40, 3, matches)]
+    before, now, scales = Loop(40, 3, Matches()), Loop(40, 3, Matches()), list[float]()
+    trials.loops = [before]
 
-    def scaled(scans: Scans, nodes: Floats, value: float) -> Floats:
-        out = nodes.copy()
-        out[:, :2] = nodes[0, :2] + 1.05 * (nodes[:, :2] - nodes[0, :2])
-        return out
+    def scaled(scans: Scans, found: MatchedDrive, watch: Progress) -> MatchedDrive:
+        scales.append(1.05)
+        assert found.loops == [before]
+        return found._replace(nodes=found.nodes * [1.05, 1.05, 1.0], loops=[now])
 
     monkeypatch.setattr(any_angle, '_scaled', scaled)
     found = any_angle.match_drive(bent[1], scans, lambda stage: quietly)
     assert found is not None
-    assert [len(loops) for loops in trials.found_before] == [0, 1, 0]
-    assert trials.found_before[1][0].matches.edges().pose[0] == pytest.approx([0.525, -0.21, 0.1])
+    assert [list(loops) for loops in trials.found_before] == [[], [now], []]
+    # the scale is examined once more at the end, without another round
+    assert len(scales) == 2
+    assert found.nodes[1, :2] == pytest.approx(1.05**2 * scans.windows.node[1, :2])
+
+
+def test_loop_closures_are_scaled_with_the_drive(monkeypatch) -> None:
+    drive, matches = Scaled(monkeypatch, 1.07, 3.0), Matches()
+    matches.add(3, 40, Match(np.array([0.5, -0.2, 0.1]), np.eye(3), 30.0), 20)
+    found = scaled_from(drive, drive.nodes, [Loop(40, 3, matches)])  # type: ignore[arg-type]
+    assert found.loops[0].matches.edges().pose[0] == pytest.approx([0.535, -0.214, 0.1])
+    assert found.loops[0].matches.mean_score == matches.mean_score
     assert matches.edges().pose[0] == pytest.approx([0.5, -0.2, 0.1])
