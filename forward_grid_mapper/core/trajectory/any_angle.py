@@ -213,14 +213,15 @@ def _scaled(scans: Scans, found: MatchedDrive, watch: Progress) -> MatchedDrive:
     if abs(steps) < LEAST_STEPS:
         return found
     scaled = at(steps)
-    better = gain_of_objective(scans, nodes, scaled).sigmas
-    if WORTH_FITTING <= better < LEAST_SIGMAS:
-        first, scaled = fitted(scans, nodes, watch), fitted(scans, scaled, watch)
-        try:
+    try:
+        better = gain_of_objective(scans, nodes, scaled).sigmas
+        if WORTH_FITTING <= better < LEAST_SIGMAS:
+            first = fitted(scans, nodes, lambda part: watch(part / 2))
+            scaled = fitted(scans, scaled, lambda part: watch((1.0 + part) / 2))
             better = gain_of_objective(scans, first, scaled).sigmas
-        except InputError:
-            # fitted trajectories may be some cells larger
-            return found
+    except InputError:
+        # between the scales that were tried, or after fitting, the map may be some cells larger
+        return found
     if better < LEAST_SIGMAS:
         return found
     # places lie in the frames of nodes, which are farther apart by the same factor
