@@ -1,6 +1,6 @@
 """The trajectory from matching alone, for walls at any angle: scan matching, then matches of blocks and loop closures.
 
-A bent trajectory has bent local maps, and few blocks fit them. So blocks are matched and loops are closed
+A bent trajectory has bent local maps, and few places are recognised on them. So blocks are matched and loops are closed
 again with the result in place of odometry, as long as J of the map of the whole drive grows.
 
 Local maps are scaled as the trajectory is, so matches confirm a wrong scale of the wheels. The map of the whole drive
@@ -45,7 +45,8 @@ SCALE_STEP, LEAST_STEPS, MOST_STEPS = 1.03, 0.5, 5
 is noisy, and number of steps at which the search ends without a result."""
 
 WORTH_FITTING = 1.0
-"""Standard errors by which J must be larger at another scale for both trajectories to be fitted."""
+"""Standard errors by which J must be larger at another scale for both trajectories to be fitted. It must be less than
+`LEAST_SIGMAS`; otherwise J is decisive without that."""
 
 
 class MatchedDrive(NamedTuple):
@@ -62,6 +63,8 @@ class MatchedDrive(NamedTuple):
         Fraction of the blocks on an earlier visit that are recognised or fit where they lie.
     scans : Scans
         With the windows that were held out.
+    usual : float
+        Mean log-likelihood ratio of a reading in the last matches, nats.
     """
 
     nodes: Floats
@@ -69,6 +72,7 @@ class MatchedDrive(NamedTuple):
     value: float
     part: float
     scans: Scans
+    usual: float = 0.0
 
 
 def match_drive(
@@ -125,7 +129,7 @@ def match_drive(
         other = scans.with_held_out(held_out(len(scans.windows), begin))
         nodes, least = scan_matched_with(TRUSTS[0], other), other.objective(other.windows.node)
         found = _match_repeatedly(odometry, other, start_stage, nodes, remaining, least)
-        if found is not None and scans.objective(found.nodes) > value:
+        if found is not None and _objective(scans, found.nodes) > value:
             best, value = found, scans.objective(found.nodes)
     return best
 
@@ -138,13 +142,14 @@ def _match_repeatedly(
     found = _rounds(scans, start_stage, start, noise, change, least)
     if found is None:
         return None
-    scaled = _scaled(scans, found, start_stage('scale'))
-    if scaled is found:
-        return found
-    # otherwise matches would take back more of it
-    change[:, :, CALIBRATION.index('scale')] = 0.0
-    found = _rounds(scans, start_stage, scaled.nodes, noise, change, scaled.value, scaled.loops) or scaled
-    return _scaled(scans, found, start_stage('scale'))
+    scaled = _scaled(found, start_stage('scale'))
+    if scaled is not found:
+        # otherwise matches would undo a part of the change
+        change[:, :, CALIBRATION.index('scale')] = 0.0
+        found = _rounds(scans, start_stage, scaled.nodes, noise, change, scaled.value, scaled.loops) or scaled
+        found = _scaled(found, start_stage('scale'))
+    watch = start_stage('places seen before')
+    return found._replace(part=fitting_part(scans, found.nodes, found.loops, found.usual, watch))
 
 
 def _rounds(
@@ -158,52 +163,50 @@ def _rounds(
 ) -> MatchedDrive | None:
     """Return the best of some rounds of matching, each from the result before; None if J is at most `least`.
 
-    With loop closures that were found before, the first round searches only near the poses that these give.
+    With loop closures that were found before, the first search is near the poses that these give. `part` is not known.
     """
     nodes, best = start, None
     for _ in range(ROUNDS):
         solver = MatchSolver(scans.windows, scans, start_stage, relative(nodes[:-1], nodes[1:]), noise, change)
         solution, loops = solver.with_matches(solution_at(nodes, len(CALIBRATION)), found_before)
         before, nodes, found_before = nodes, solution.nodes, ()
-        value = scans.objective(nodes)
+        value = _objective(scans, nodes)
         if value <= least:
             break
-        best, least, usual = MatchedDrive(nodes, loops, value, 0.0, scans), value, solver.usual
+        best, least = MatchedDrive(nodes, loops, value, math.nan, scans, solver.usual), value
         settled = rms_after_alignment(before, nodes) < SETTLED
         # blocks that are not recognised may fit a map that is still bent
         if settled or recognised_part(scans, nodes, loops) >= LEAST_RECOGNISED:
             break
-    if best is None:
-        return None
-    part = fitting_part(scans, best.nodes, best.loops, usual, start_stage('places seen before'))
-    return best._replace(part=part)
+    return best
 
 
-def _scaled(scans: Scans, found: MatchedDrive, watch: Progress) -> MatchedDrive:
+def _objective(scans: Scans, nodes: Floats) -> float:
+    """Return J of nodes, nats; −inf if the map along them would be too large."""
+    try:
+        return scans.objective(nodes)
+    except InputError:
+        return -math.inf
+
+
+def _scaled(found: MatchedDrive, watch: Progress) -> MatchedDrive:
     """Return the drive at the scale of the largest J if that is clearly larger, otherwise `found` itself.
 
-    If it may be, both are fitted to their own maps first, since a trajectory that was matched at one scale does not fit
-    the map at another.
+    A trajectory that was matched at one scale does not fit the map at another. So if J is larger, but not clearly, both
+    are fitted to their own maps, and J of these decides.
     """
-    nodes = found.nodes
+    nodes, scans = found.nodes, found.scans
 
     def at(steps: float) -> Floats:
         out = nodes.copy()
         out[:, :2] = nodes[0, :2] + SCALE_STEP**steps * (nodes[:, :2] - nodes[0, :2])
         return out
 
-    def objective(steps: int) -> float:
-        try:
-            return scans.objective(at(steps))
-        except InputError:
-            # the map of a larger trajectory may be too large
-            return -math.inf
-
-    values = {0: found.value, **{step: objective(step) for step in (-1, 1)}}
+    values = {0: found.value, **{step: _objective(scans, at(step)) for step in (-1, 1)}}
     top = max(values, key=values.__getitem__)
     while top in (min(values), max(values)) and abs(top) < MOST_STEPS:
         beyond = top + int(np.sign(top))
-        values[beyond] = objective(beyond)
+        values[beyond] = _objective(scans, at(beyond))
         top = max(values, key=values.__getitem__)
     if top in (min(values), max(values)):
         return found
@@ -217,8 +220,8 @@ def _scaled(scans: Scans, found: MatchedDrive, watch: Progress) -> MatchedDrive:
         better = gain_of_objective(scans, nodes, scaled).sigmas
         if WORTH_FITTING <= better < LEAST_SIGMAS:
             first = fitted(scans, nodes, lambda part: watch(part / 2))
-            scaled = fitted(scans, scaled, lambda part: watch((1.0 + part) / 2))
-            better = gain_of_objective(scans, first, scaled).sigmas
+            second = fitted(scans, scaled, lambda part: watch((1.0 + part) / 2))
+            better = gain_of_objective(scans, first, second).sigmas
     except InputError:
         # between the scales that were tried, or after fitting, the map may be some cells larger
         return found
@@ -226,4 +229,4 @@ def _scaled(scans: Scans, found: MatchedDrive, watch: Progress) -> MatchedDrive:
         return found
     # places lie in the frames of nodes, which are farther apart by the same factor
     loops = [replace(loop, matches=loop.matches.scaled(SCALE_STEP**steps)) for loop in found.loops]
-    return found._replace(nodes=scaled, loops=loops, value=scans.objective(scaled))
+    return found._replace(nodes=scaled, loops=loops, value=_objective(scans, scaled))

@@ -105,8 +105,8 @@ class MatchSolver:
     def with_matches(self, solution: Solution, found_before: Sequence[Loop] = ()) -> tuple[Solution, list[Loop]]:
         """Return the solution with matches and loop closures, starting from `solution`, and the loop closures.
 
-        `found_before` are loop closures of an earlier solution. They make the first search narrower, and are no part of
-        the result.
+        `found_before` are loop closures of an earlier solution. The first search is near the poses that these give, and
+        narrower than without them. They are no part of the result.
         """
         known, loops = SearchResults(), list[Loop]()
         for match, stage in ((match_preceding, 'matching'), (match_surrounding, 'matching again')):
@@ -115,7 +115,6 @@ class MatchSolver:
             edges, self.usual = _edges_of(found), found.mean_score
             walls = self._walls(solution.nodes, True)
             both = joined(edges, *(_edges_of(loop.matches) for loop in (*found_before, *loops_of(known))))
-            found_before = ()
             solution = solve(self._graph(both, walls), solution.nodes, solution.calibration, SAMPLES)
             watch, searched = self._start_stage('places seen before'), solution.nodes
             results = find_loops(self._scans, searched, solution.samples, found.mean_score, watch, known)
@@ -127,6 +126,9 @@ class MatchSolver:
                 break
             # blocks of a stretch that was moved must be searched again
             known = self._unchanged(results, searched, solution.nodes) if solution is first else SearchResults()
+            if found_before:
+                # the next search is wider
+                known, found_before = {key: loop for key, loop in known.items() if loop is not None}, ()
         return solution, loops
 
     def _with_stretches_relocated(

@@ -32,7 +32,7 @@ class Trials:
     Parameters
     ----------
     values : list of float, float
-        The part of the blocks that are recognised, or fit, in each round, and its J.
+        The part of the blocks that are recognised in each round, and its J. `more` is the part that only fits.
     far : float
         Metres by which a round moves the nodes.
     others : tuple of int
@@ -53,8 +53,11 @@ class Trials:
         monkeypatch.setattr(Scans, 'objective', lambda *rest: values[len(self.calls) - 1][1] if self.calls else 0.0)
         self._parts = [part for part, _ in values]
         self.part_of: dict[bytes, float] = {}
-        for name in ('fitting_part', 'recognised_part'):
-            monkeypatch.setattr(any_angle, name, lambda scans, nodes, *rest: self.part_of[nodes.tobytes()])
+        self.more = 0.0
+        monkeypatch.setattr(any_angle, 'recognised_part', lambda scans, nodes, *rest: self.part_of[nodes.tobytes()])
+        monkeypatch.setattr(
+            any_angle, 'fitting_part', lambda scans, nodes, *rest: self.more + self.part_of[nodes.tobytes()]
+        )
 
     def _solver(self, windows, scans, say, motion: Floats, noise: float, change) -> Trials:
         self.calls.append((motion, noise))
@@ -106,6 +109,29 @@ def test_rounds_continue_while_few_places_are_recognised_and_j_grows(
     assert len(trials.calls) == len(values)
     assert found.value == max(value for _, value in values)
     assert found.nodes[-1, 0] - scans.windows.node[-1, 0] == pytest.approx(rounds)
+
+
+def test_if_blocks_fit_rounds_continue_but_no_other_start_is_tried(bent, scans, monkeypatch) -> None:
+    trials = Trials(monkeypatch, [(0.5, 1.0), (0.5, 2.0), (0.5, 1.5)])
+    trials.more = 0.4
+    found = any_angle.match_drive(bent[1], scans, lambda stage: quietly)
+    assert found is not None
+    assert (len(trials.calls), found.value, found.part) == (3, 2.0, 0.9)
+
+
+def test_round_whose_map_would_be_too_large_is_the_last(bent, scans, monkeypatch) -> None:
+    trials = Trials(monkeypatch, [(0.5, 1.0), (0.9, 2.0)])
+    trials.more, objective = 0.4, Scans.objective
+
+    def limited(s: Scans, nodes: Floats) -> float:
+        if len(trials.calls) == 2:
+            raise InputError('the map would be too large')
+        return objective(s, nodes)
+
+    monkeypatch.setattr(Scans, 'objective', limited)
+    found = any_angle.match_drive(bent[1], scans, lambda stage: quietly)
+    assert found is not None
+    assert (len(trials.calls), found.value) == (2, 1.0)
 
 
 def test_without_gain_over_odometry_no_more_rounds_are_tried(bent, scans, monkeypatch) -> None:
@@ -205,7 +231,9 @@ def test_search_that_got_lost_is_repeated_with_other_windows_held_out(
 def scaled_from(scans: Scans, nodes: Floats, loops: Sequence[Loop] = ()) -> MatchedDrive:
     """Return the drive at the best scale, and the same object if this is the one that it has."""
     found = MatchedDrive(nodes, [*loops], scans.objective(nodes), 1.0, scans)
-    return any_angle._scaled(scans, found, lambda part: None)
+    moved = any_angle._scaled(found, lambda part: None)
+    assert (moved is found) == (moved.nodes is nodes)
+    return moved
 
 
 @pytest.mark.parametrize('factor', [0.9, 1.1])
@@ -233,7 +261,13 @@ class Scaled:
         self.nodes = np.array([[1.0, 2.0, 0.3], [4.0, 6.0, 0.5]])
         self._best = best
         gains, self.fitted = iter([*sigmas, sigmas[-1]]), list[Floats]()
-        monkeypatch.setattr(any_angle, 'gain_of_objective', lambda *rest: Gain(next(gains), 1.0))
+
+        def gain_of_objective(scans: Scans, before: Floats, after: Floats) -> Gain:
+            # the fitted ones are turned
+            assert np.ptp([before[0, 2], after[0, 2], self.nodes[0, 2] + 0.1 * bool(self.fitted)]) < 1e-9
+            return Gain(next(gains), 1.0)
+
+        monkeypatch.setattr(any_angle, 'gain_of_objective', gain_of_objective)
 
         def fitted(scans: Scans, nodes: Floats, watch: Progress) -> Floats:
             self.fitted.append(nodes)
@@ -247,6 +281,8 @@ class Scaled:
 
     def scale(self) -> float:
         found = scaled_from(self, self.nodes).nodes  # type: ignore[arg-type]
+        # fitted trajectories are only compared
+        np.testing.assert_array_equal(found[:, 2], self.nodes[:, 2])
         return float(np.hypot(*(found[1] - found[0])[:2])) / 5.0
 
 
@@ -310,7 +346,8 @@ def test_next_round_holds_the_scale_that_was_found(bent, scans, monkeypatch) -> 
     trials = Trials(monkeypatch, [(0.9, 1.0), (0.9, 2.0)], far=0.0)
     larger = scans.windows.node * [1.05, 1.05, 1.0]
 
-    def scaled(scans: Scans, found: MatchedDrive, watch: Progress) -> MatchedDrive:
+    def scaled(found: MatchedDrive, watch: Progress) -> MatchedDrive:
+        trials.part_of[larger.tobytes()] = 0.9
         return found._replace(nodes=larger) if len(trials.calls) == 1 else found
 
     monkeypatch.setattr(any_angle, '_scaled', scaled)
@@ -327,17 +364,20 @@ def test_first_round_at_another_scale_searches_near_the_loop_closures_before(ben
     before, now, scales = Loop(40, 3, Matches()), Loop(40, 3, Matches()), list[float]()
     trials.loops = [before]
 
-    def scaled(scans: Scans, found: MatchedDrive, watch: Progress) -> MatchedDrive:
+    def scaled(found: MatchedDrive, watch: Progress) -> MatchedDrive:
         scales.append(1.05)
         assert found.loops == [before]
-        return found._replace(nodes=found.nodes * [1.05, 1.05, 1.0], loops=[now])
+        nodes = found.nodes * [1.05, 1.05, 1.0]
+        # the part that fits is that of the last scale
+        trials.part_of[nodes.tobytes()] = 0.9 + 0.01 * len(scales)
+        return found._replace(nodes=nodes, loops=[now])
 
     monkeypatch.setattr(any_angle, '_scaled', scaled)
     found = any_angle.match_drive(bent[1], scans, lambda stage: quietly)
     assert found is not None
     assert [list(loops) for loops in trials.found_before] == [[], [now], []]
     # the scale is examined once more at the end, without another round
-    assert len(scales) == 2
+    assert (len(scales), found.part) == (2, 0.92)
     assert found.nodes[1, :2] == pytest.approx(1.05**2 * scans.windows.node[1, :2])
 
 

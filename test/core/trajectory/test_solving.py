@@ -15,7 +15,7 @@ from forward_grid_mapper.core.trajectory.heading import Heading
 from forward_grid_mapper.core.trajectory.loops import Loop, SearchResults
 from forward_grid_mapper.core.trajectory.matching import Match
 from forward_grid_mapper.core.trajectory.odometry_model import CALIBRATION, motions, sensitivity
-from forward_grid_mapper.core.trajectory.passes import Matches
+from forward_grid_mapper.core.trajectory.passes import Matches, Progress
 from forward_grid_mapper.core.trajectory.pose_graph import solution_at
 from forward_grid_mapper.core.trajectory.poses import relative, wrapped
 from forward_grid_mapper.core.trajectory.scans import Scans
@@ -41,22 +41,27 @@ def solver_of(exact: tuple[Odometry, Windows, Scans, Heading], heading_of_walls:
 
 @pytest.mark.parametrize('known', [False, True])
 def test_only_the_first_search_is_as_wide_as_loop_closures_from_before_leave_it(exact, monkeypatch, known) -> None:
-    """Later searches are as wide as those that were found leave it."""
+    """Blocks that the narrow search did not recognise are searched again."""
     odometry, windows, scans, _ = exact
     solver = MatchSolver(windows, scans, quietly, motions(odometry, windows), 0.1, sensitivity(odometry, windows))
-    nodes, last, spreads = windows.node, len(windows) - 1, list[float]()
+    nodes, last, spreads, results = windows.node, len(windows) - 1, list[float](), list[SearchResults]()
     matches = Matches()
     matches.add(0, last, Match(relative(nodes[0], nodes[last]), 1e6 * np.eye(3), 30.0), 20)
 
-    def find_loops(scans: Scans, nodes: Floats, samples: Floats, *rest: object) -> SearchResults:
+    def find_loops(
+        scans: Scans, nodes: Floats, samples: Floats, usual: float, watch: Progress, taken: SearchResults
+    ) -> SearchResults:
         spreads.append(float(samples[:, last, :2].std()))
-        return {}
+        results.append(taken)
+        return {(last, 0): None}
 
     monkeypatch.setattr(solving, 'find_loops', find_loops)
     monkeypatch.setattr(solving, 'SETTLED', 0.0)
+    monkeypatch.setattr(MatchSolver, '_unchanged', lambda self, results, *rest: results)
     solver.with_matches(solution_at(nodes, len(CALIBRATION)), [Loop(last, 0, matches)] if known else [])
     assert (spreads[0] < 0.01) == known
     assert spreads[1] > 0.02
+    assert results == [{}, {} if known else {(last, 0): None}]
 
 
 def turned(windows: Windows, nodes: Floats) -> Floats:
