@@ -28,7 +28,7 @@ from .odometry_model import CALIBRATION, sensitivity
 from .passes import Progress
 from .pose_graph import solution_at
 from .poses import relative, rms_after_alignment
-from .relocating import LEAST_RECOGNISED, fitting_part, recognised_part
+from .relocating import LEAST_RECOGNISED, recognised_part
 from .scan_matching import TRUSTS, Trust, scan_matched
 from .scans import Scans
 from .solving import SETTLED, MatchSolver
@@ -60,11 +60,9 @@ class MatchedDrive(NamedTuple):
     value : float
         `Scans.objective` of the nodes, nats.
     part : float
-        Fraction of the blocks on an earlier visit that are recognised or fit where they lie.
+        Fraction of the blocks on an earlier visit that are recognised.
     scans : Scans
         With the windows that were held out.
-    usual : float
-        Mean log-likelihood ratio of a reading in the last matches, nats.
     """
 
     nodes: Floats
@@ -72,7 +70,6 @@ class MatchedDrive(NamedTuple):
     value: float
     part: float
     scans: Scans
-    usual: float = 0.0
 
 
 def match_drive(
@@ -85,9 +82,9 @@ def match_drive(
 ) -> MatchedDrive | None:
     """Return the trajectory of a drive from matching alone; None if its J is not larger than that of odometry.
 
-    If the trajectory from walls is `known`, J must be larger than that of it as well. If few blocks fit the map of
-    earlier visits, the search got lost somewhere. Small changes then lead to other places, so it is repeated with other
-    windows held out, and J decides.
+    If the trajectory from walls is `known`, J must be larger than that of it as well. If few places are recognised, the
+    search got lost somewhere. Small changes then lead to other places, so it is repeated with other windows held out,
+    and J decides.
 
     Parameters
     ----------
@@ -100,7 +97,7 @@ def match_drive(
     known : float64, shape (K, 3), optional
         Nodes of the trajectory from walls.
     start : float64, shape (K, 3), optional
-        Nodes from which matching starts if few blocks fit when it starts from those of scan matching.
+        Nodes from which matching starts if it recognises few places from those of scan matching.
     """
     best, value = None, scans.objective(scans.windows.node)
     if known is not None:
@@ -120,7 +117,7 @@ def match_drive(
         found = _match_repeatedly(odometry, scans, start_stage, make(), remaining, value)
         if found is not None:
             best, value = found, found.value
-        # if most blocks fit, another trial hardly helps
+        # if most places are recognised another trial hardly helps
         if best is not None and best.part >= LEAST_RECOGNISED:
             break
     for begin in OTHERS:
@@ -148,8 +145,7 @@ def _match_repeatedly(
         change[:, :, CALIBRATION.index('scale')] = 0.0
         found = _rounds(scans, start_stage, scaled.nodes, noise, change, scaled.value, scaled.loops) or scaled
         found = _scaled(found, start_stage('scale'))
-    watch = start_stage('places seen before')
-    return found._replace(part=fitting_part(scans, found.nodes, found.loops, found.usual, watch))
+    return found
 
 
 def _rounds(
@@ -163,7 +159,7 @@ def _rounds(
 ) -> MatchedDrive | None:
     """Return the best of some rounds of matching, each from the result before; None if J is at most `least`.
 
-    With loop closures that were found before, the first search is near the poses that these give. `part` is not known.
+    With loop closures that were found before, the first search is near the poses that these give.
     """
     nodes, best = start, None
     for _ in range(ROUNDS):
@@ -173,10 +169,8 @@ def _rounds(
         value = _objective(scans, nodes)
         if value <= least:
             break
-        best, least = MatchedDrive(nodes, loops, value, math.nan, scans, solver.usual), value
-        settled = rms_after_alignment(before, nodes) < SETTLED
-        # blocks that are not recognised may fit a map that is still bent
-        if settled or recognised_part(scans, nodes, loops) >= LEAST_RECOGNISED:
+        best, least = MatchedDrive(nodes, loops, value, recognised_part(scans, nodes, loops), scans), value
+        if best.part >= LEAST_RECOGNISED or rms_after_alignment(before, nodes) < SETTLED:
             break
     return best
 

@@ -36,7 +36,7 @@ from .odometry_model import CALIBRATION
 from .outcome import Differences, Refinement, differences, joined_parts, replaced, with_all_poses, with_outliers
 from .passes import BLOCK
 from .refinable import unfit, without_times
-from .relocating import LEAST_RECOGNISED, confirmed_by_places, recognised_part
+from .relocating import LEAST_RECOGNISED, confirmed_by_places
 from .right_angles import at_right_angles, proven_in_folds
 from .scans import Scans
 from .standing import without_stands
@@ -161,7 +161,7 @@ class Refiner:
             return _without_better(by_walls.refinement)
         within = gain_within_visits(scans, windows.node, nodes, self._start_stage('judgement'))
         if not confirmed_by_places(scans, nodes, found.loops) and within.sigmas < LEAST_SIGMAS:
-            return _without_better(by_walls.refinement, unconfirmed_words(recognised_part(scans, nodes, found.loops)))
+            return _without_better(by_walls.refinement, unconfirmed_words(found.part))
         if is_worse_nearby(within, better):
             return _without_better(by_walls.refinement, WORSE_NEARBY)
         if known is None and (walls := self._by_walls_after_all(drive, by_walls, found, least)) is not None:
@@ -174,7 +174,8 @@ class Refiner:
         }
         return Refinement(
             True,
-            f'walls are not assumed to be at right angles; {at_revisits}{gain_words(better)}{_bend_words(found.part)}',
+            f'walls are not assumed to be at right angles; {at_revisits}{gain_words(better)}'
+            f'{_recognition_words(found.part)}',
             replaced(readings, odometry, trajectory),
             trajectory,
             by_name,
@@ -287,11 +288,11 @@ def _unsupported(drive: Drive, by_walls: Attempt, better: Gain) -> Refinement:
     return Refinement(False, reason + NOR_MATCHES, drive.readings, drive.odometry, found.calibration, gain=found.gain)
 
 
-def _bend_words(part: float) -> str:
-    """Return the warning about the fraction of blocks that fit the map of earlier visits; empty if it is large."""
+def _recognition_words(part: float) -> str:
+    """Return the warning about the fraction of blocks on earlier visits that are recognised; empty if it is large."""
     if part >= LEAST_RECOGNISED:
         return ''
-    return f'; only {part:.0%} of the path through places seen before fits their maps: the drive may be bent as a whole'
+    return f'; {part:.0%} of the path through places seen before is recognised: the drive may be bent as a whole'
 
 
 def _report_part(watch: Watch, name: str, stage: str, part: float) -> None:

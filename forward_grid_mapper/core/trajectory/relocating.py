@@ -10,19 +10,16 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..common.readings import Floats
-from ..runtime.threads import in_order
 from .likelihood import Scan, scores
 from .local_map import LocalMap
-from .loops import APART, LENGTH, MEASURED, SHARED, Loop, Places, find_loop
+from .loops import APART, LENGTH, SHARED, Loop, Places, find_loop
 from .loops import REACH as LOOP_REACH
-from .matching import climbed, grid_around, measure
-from .passes import Progress
+from .matching import grid_around
 from .poses import compose, relative
 from .scans import FEWEST_ON_MAP, Scans
 
@@ -64,11 +61,7 @@ SIGMA = np.array([0.1, 0.1, math.radians(1.5)])
 """σ of the pose of a block after its stretch was moved: metres, metres, radians."""
 
 LEAST_RECOGNISED = 0.85
-"""Fraction of the blocks on an earlier visit that are recognised, or fit, if the trajectory is not bent."""
-
-FITTING, STAYS = 0.5, np.array([0.2, 0.2, math.radians(4.0)])
-"""A block fits where it lies if its readings have more than this fraction of the usual score at the nearest maximum,
-and if this is at most so far away: metres, metres, radians."""
+"""Fraction of the blocks on an earlier visit that are recognised if the trajectory is not bent."""
 
 MORE_RECOGNISED = 2
 """This many more blocks must be recognised at another place."""
@@ -85,15 +78,15 @@ def revisits(scans: Scans, nodes: Floats, passed: int | None = None) -> NDArray[
     With `passed`, only blocks after this node that lie on a visit before it.
     """
     progress, out = scans.windows.node_progress, []
-    for number in range(-(-(len(nodes) - LENGTH // 2) // LENGTH)):
-        middle = _middle(number, nodes)
+    for first in range(0, len(nodes) - LENGTH // 2, LENGTH):
+        middle = min(first + LENGTH // 2, len(nodes) - 1)
         if passed is not None and middle < passed:
             continue
         # progress increases, so earlier nodes are the first ones
         until = int(np.searchsorted(progress, progress[middle] - APART))
         before = nodes[: until if passed is None else min(until, passed), :2]
         if len(before) and np.hypot(*(before - nodes[middle, :2]).T).min() < NEAR:
-            out.append(number)
+            out.append(first // LENGTH)
     return np.array(out, np.int64)
 
 
@@ -101,57 +94,6 @@ def recognised_part(scans: Scans, nodes: Floats, loops: Sequence[Loop]) -> float
     """Return the fraction of the blocks on an earlier visit that are recognised; 1 if there are none."""
     blocks = revisits(scans, nodes).tolist()
     return len(recognised(loops).intersection(blocks)) / len(blocks) if blocks else 1.0
-
-
-def fitting_part(scans: Scans, nodes: Floats, loops: Sequence[Loop], usual: float, watch: Progress) -> float:
-    """Return the fraction of the blocks on an earlier visit that are recognised or fit where they lie.
-
-    It is 1 if there are no such blocks.
-
-    In a place that looks alike from two poses, a block is not recognised, and in one with small objects its readings
-    score less than elsewhere. So a block that is not recognised is no evidence of a wrong trajectory if it fits.
-
-    Parameters
-    ----------
-    scans : Scans
-    nodes : float64, shape (K, 3)
-    loops : sequence of Loop
-    usual : float
-        Usual log-likelihood ratio of a reading, nats.
-    watch : callable
-        Receives the fraction of the work that is done.
-    """
-    blocks, seen, places = revisits(scans, nodes).tolist(), recognised(loops), Places(scans, nodes)
-    work = [partial(_fits, scans, nodes, block, places, usual) for block in blocks if block not in seen]
-    if not blocks:
-        return 1.0
-    fitting = len(blocks) - len(work)
-    for done, fits in enumerate(in_order(work, scans.threads)):
-        watch(done / len(work))
-        fitting += fits
-    return fitting / len(blocks)
-
-
-def _fits(scans: Scans, nodes: Floats, number: int, places: Places, usual: float) -> bool:
-    """Return whether a block fits the map of the nearest earlier visit where it lies."""
-    block, middle = windows_of(np.array([number]), len(nodes)), _middle(number, nodes)
-    before, progress = np.arange(0, len(nodes), SHARED), scans.windows.node_progress
-    before = before[progress[before] < progress[middle] - APART]
-    if scans.count[block].sum() < FEWEST_ON_MAP or usual <= 0.0:
-        return False
-    place = int(before[np.hypot(*(nodes[before, :2] - nodes[middle, :2]).T).argmin()])
-    around = places[place]
-    if around is None:
-        return False
-    joint, pose = scans.joint(block, relative(nodes[middle], nodes[block])), relative(nodes[place], nodes[middle])
-    best = climbed(joint, around, pose, MEASURED)
-    score = measure(joint, around, best, MEASURED).score
-    return bool(score > FITTING * usual * len(joint.readings) and (np.abs(relative(pose, best)) <= STAYS).all())
-
-
-def _middle(number: int, nodes: Floats) -> int:
-    """Return the node in the middle of a block."""
-    return min(number * LENGTH + LENGTH // 2, len(nodes) - 1)
 
 
 def confirmed_by_places(scans: Scans, nodes: Floats, loops: Sequence[Loop]) -> bool:

@@ -79,11 +79,6 @@ class MatchSolver:
         σ of its yaw, radians a √metre.
     change : float64, shape (K − 1, 3, C)
         Derivative of `motion` with respect to the calibration.
-
-    Attributes
-    ----------
-    usual : float
-        Mean log-likelihood ratio of a reading in the last matches with local maps, nats.
     """
 
     def __init__(
@@ -100,7 +95,7 @@ class MatchSolver:
         information = np.asarray(np.linalg.inv(covariances(windows, Noise(yaw=noise))), np.float64)
         count = np.arange(len(windows))
         self._steps = Edges(count[:-1], count[1:], motion, information)
-        self._yaws, self.usual = no_yaws(), 0.0
+        self._yaws = no_yaws()
 
     def with_matches(self, solution: Solution, found_before: Sequence[Loop] = ()) -> tuple[Solution, list[Loop]]:
         """Return the solution with matches and loop closures, starting from `solution`, and the loop closures.
@@ -112,7 +107,7 @@ class MatchSolver:
         for match, stage in ((match_preceding, 'matching'), (match_surrounding, 'matching again')):
             before = solution.nodes
             found = match(self._scans, solution.nodes, self._start_stage(stage))
-            edges, self.usual = _edges_of(found), found.mean_score
+            edges = _edges_of(found)
             walls = self._walls(solution.nodes, True)
             both = joined(edges, *(_edges_of(loop.matches) for loop in (*found_before, *loops_of(known))))
             solution = solve(self._graph(both, walls), solution.nodes, solution.calibration, SAMPLES)

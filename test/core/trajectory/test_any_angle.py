@@ -32,7 +32,7 @@ class Trials:
     Parameters
     ----------
     values : list of float, float
-        The part of the blocks that are recognised in each round, and its J. `more` is the part that only fits.
+        The part of the blocks that are recognised in each round, and its J.
     far : float
         Metres by which a round moves the nodes.
     others : tuple of int
@@ -44,20 +44,13 @@ class Trials:
     ) -> None:
         monkeypatch.setattr(any_angle, 'OTHERS', others)
         self.calls: list[tuple[Floats, float]] = []
-        self.usual = 1.0
         self._far = far
         self.loops: list[Loop] = []
         self.found_before: list[Sequence[Loop]] = []
         monkeypatch.setattr(any_angle, 'MatchSolver', self._solver)
         monkeypatch.setattr(any_angle, 'scan_matched', lambda scans, trust, watch: scans.windows.node)
         monkeypatch.setattr(Scans, 'objective', lambda *rest: values[len(self.calls) - 1][1] if self.calls else 0.0)
-        self._parts = [part for part, _ in values]
-        self.part_of: dict[bytes, float] = {}
-        self.more = 0.0
-        monkeypatch.setattr(any_angle, 'recognised_part', lambda scans, nodes, *rest: self.part_of[nodes.tobytes()])
-        monkeypatch.setattr(
-            any_angle, 'fitting_part', lambda scans, nodes, *rest: self.more + self.part_of[nodes.tobytes()]
-        )
+        monkeypatch.setattr(any_angle, 'recognised_part', lambda *rest: values[len(self.calls) - 1][0])
 
     def _solver(self, windows, scans, say, motion: Floats, noise: float, change) -> Trials:
         self.calls.append((motion, noise))
@@ -69,7 +62,6 @@ class Trials:
         nodes = solution.nodes.copy()
         np.testing.assert_array_equal(self.calls[-1][0], relative(nodes[:-1], nodes[1:]))
         nodes[len(nodes) // 2 :, 0] += self._far
-        self.part_of[nodes.tobytes()] = self._parts[len(self.calls) - 1]
         return solution_at(nodes, 4), self.loops
 
 
@@ -111,17 +103,8 @@ def test_rounds_continue_while_few_places_are_recognised_and_j_grows(
     assert found.nodes[-1, 0] - scans.windows.node[-1, 0] == pytest.approx(rounds)
 
 
-def test_if_blocks_fit_rounds_continue_but_no_other_start_is_tried(bent, scans, monkeypatch) -> None:
-    trials = Trials(monkeypatch, [(0.5, 1.0), (0.5, 2.0), (0.5, 1.5)])
-    trials.more = 0.4
-    found = any_angle.match_drive(bent[1], scans, lambda stage: quietly)
-    assert found is not None
-    assert (len(trials.calls), found.value, found.part) == (3, 2.0, 0.9)
-
-
 def test_round_whose_map_would_be_too_large_is_the_last(bent, scans, monkeypatch) -> None:
-    trials = Trials(monkeypatch, [(0.5, 1.0), (0.9, 2.0)])
-    trials.more, objective = 0.4, Scans.objective
+    trials, objective = Trials(monkeypatch, [(0.5, 1.0), (0.9, 2.0), (0.9, 0.5)]), Scans.objective
 
     def limited(s: Scans, nodes: Floats) -> float:
         if len(trials.calls) == 2:
@@ -131,7 +114,8 @@ def test_round_whose_map_would_be_too_large_is_the_last(bent, scans, monkeypatch
     monkeypatch.setattr(Scans, 'objective', limited)
     found = any_angle.match_drive(bent[1], scans, lambda stage: quietly)
     assert found is not None
-    assert (len(trials.calls), found.value) == (2, 1.0)
+    # the other start is tried
+    assert (len(trials.calls), found.value) == (3, 1.0)
 
 
 def test_without_gain_over_odometry_no_more_rounds_are_tried(bent, scans, monkeypatch) -> None:
@@ -167,7 +151,7 @@ def test_rounds_end_early_below_the_j_of_a_known_trajectory(bent, scans, monkeyp
 @pytest.mark.parametrize(
     ('values', 'begins', 'value'),
     [
-        # nothing more is tried if most blocks fit
+        # nothing more is tried if most places are recognised
         ([(0.9, 1.0)], [0.0], 1.0),
         ([(0.5, 1.0), (0.5, 0.5), (0.9, 3.0)], [0.0, 1.0, 5.0], 3.0),
         ([(0.5, 1.0), (0.5, 0.5), (0.5, 0.5), (0.9, 3.0)], [0.0, 1.0, 5.0, 0.0], 3.0),
@@ -347,7 +331,6 @@ def test_next_round_holds_the_scale_that_was_found(bent, scans, monkeypatch) -> 
     larger = scans.windows.node * [1.05, 1.05, 1.0]
 
     def scaled(found: MatchedDrive, watch: Progress) -> MatchedDrive:
-        trials.part_of[larger.tobytes()] = 0.9
         return found._replace(nodes=larger) if len(trials.calls) == 1 else found
 
     monkeypatch.setattr(any_angle, '_scaled', scaled)
@@ -367,17 +350,14 @@ def test_first_round_at_another_scale_searches_near_the_loop_closures_before(ben
     def scaled(found: MatchedDrive, watch: Progress) -> MatchedDrive:
         scales.append(1.05)
         assert found.loops == [before]
-        nodes = found.nodes * [1.05, 1.05, 1.0]
-        # the part that fits is that of the last scale
-        trials.part_of[nodes.tobytes()] = 0.9 + 0.01 * len(scales)
-        return found._replace(nodes=nodes, loops=[now])
+        return found._replace(nodes=found.nodes * [1.05, 1.05, 1.0], loops=[now])
 
     monkeypatch.setattr(any_angle, '_scaled', scaled)
     found = any_angle.match_drive(bent[1], scans, lambda stage: quietly)
     assert found is not None
     assert [list(loops) for loops in trials.found_before] == [[], [now], []]
     # the scale is examined once more at the end, without another round
-    assert (len(scales), found.part) == (2, 0.92)
+    assert len(scales) == 2
     assert found.nodes[1, :2] == pytest.approx(1.05**2 * scans.windows.node[1, :2])
 
 

@@ -176,14 +176,12 @@ def test_matching_is_compared_with_odometry_within_a_few_metres(
         return Attempt(Refinement(False, 'no walls', readings, odometry, {}), drive.windows.node)
 
     def matched(odometry: Odometry, scans: Scans, *rest) -> MatchedDrive:
-        # blocks that fit without being recognised do not confirm it
-        return MatchedDrive(scans.windows.node * (1.1, 1.0, 1.0), [], 0.0, 1.0, scans)
+        return MatchedDrive(scans.windows.node * (1.1, 1.0, 1.0), [], 0.0, part, scans)
 
     monkeypatch.setattr(refinement, 'at_right_angles', at_right_angles)
     monkeypatch.setattr(refinement, 'match_drive', matched)
     monkeypatch.setattr(refinement, 'gain_at_revisits', lambda *rest: Gain(everywhere, 0.1))
     monkeypatch.setattr(refinement, 'confirmed_by_places', lambda *rest: confirmed)
-    monkeypatch.setattr(refinement, 'recognised_part', lambda *rest: part)
     monkeypatch.setattr(refinement, 'gain_within_visits', lambda *rest: Gain(within, 0.1))
     found = Refiner(Parameters()).run(readings, odometry)
     assert found.accepted == accepted

@@ -11,17 +11,15 @@ import pytest
 from exact_tour import Tour, quietly, tour_with
 
 from forward_grid_mapper.core.common.readings import Floats
-from forward_grid_mapper.core.trajectory import hypotheses, relocating, solving
+from forward_grid_mapper.core.trajectory import hypotheses, solving
 from forward_grid_mapper.core.trajectory.doubts import DOUBTFUL, doubts, slight
 from forward_grid_mapper.core.trajectory.heading import Heading
 from forward_grid_mapper.core.trajectory.holding_out import LEAST_SIGMAS, Gain
 from forward_grid_mapper.core.trajectory.hypotheses import MOST_DOUBTFUL, solve_hypotheses
 from forward_grid_mapper.core.trajectory.judging import gain_at_revisits, gain_within_visits
-from forward_grid_mapper.core.trajectory.likelihood import Scan
-from forward_grid_mapper.core.trajectory.local_map import LocalMap
-from forward_grid_mapper.core.trajectory.loops import APART, LENGTH, SHARED, Loop
+from forward_grid_mapper.core.trajectory.loops import APART, LENGTH, Loop
 from forward_grid_mapper.core.trajectory.matching import Match
-from forward_grid_mapper.core.trajectory.passes import Matches, match_preceding, match_surrounding
+from forward_grid_mapper.core.trajectory.passes import Matches, match_preceding
 from forward_grid_mapper.core.trajectory.pose_graph import solution_at
 from forward_grid_mapper.core.trajectory.poses import compose, relative
 from forward_grid_mapper.core.trajectory.relocating import (
@@ -29,18 +27,14 @@ from forward_grid_mapper.core.trajectory.relocating import (
     FEW,
     LEAST_RECOGNISED,
     RUN,
-    STAYS,
     confirmed,
     confirmed_by_places,
     displaced,
-    fitting_part,
     recognised,
-    recognised_part,
     revisits,
     unsupported,
     windows_of,
 )
-from forward_grid_mapper.core.trajectory.scans import FEWEST_ON_MAP
 from forward_grid_mapper.core.trajectory.solving import Solver
 from forward_grid_mapper.simulation.sonar import sonar_ring
 from forward_grid_mapper.simulation.world import building_tour
@@ -209,87 +203,6 @@ def test_doubtful_place_is_in_the_middle_of_a_drop_of_certainty() -> None:
     both = certain * little
     total = sum(p for _, p in (*doubts(at, both), *slight(at, both)))
     assert total == pytest.approx(1.0 - both[-1], abs=1e-9)
-
-
-def fitting(tour: Tour, nodes: Floats, loops: list[Loop], usual: float | None = None) -> float:
-    """Return `fitting_part`; the usual score is that along the right trajectory, if it is not given."""
-    if usual is None:
-        usual = match_surrounding(tour.scans, tour.windows.node, ignored).mean_score
-    return fitting_part(tour.scans, nodes, loops, usual, ignored)
-
-
-def ignored(part: float) -> None:
-    """Ignore progress."""
-
-
-def test_blocks_fit_along_the_right_trajectory_although_they_are_not_recognised(there_and_back) -> None:
-    scans, true = there_and_back.scans, there_and_back.windows.node
-    assert recognised_part(scans, true, []) == 0.0
-    assert fitting(there_and_back, true, []) >= LEAST_RECOGNISED
-
-
-def test_blocks_do_not_fit_along_a_wrong_trajectory(there_and_back) -> None:
-    wrong, first = astray(there_and_back), turning(there_and_back)
-    blocks = revisits(there_and_back.scans, wrong)
-    back = blocks[blocks * LENGTH > first]
-    assert len(back) >= RUN
-    # those of the way there lie right, and some of the way back fit by chance
-    assert fitting(there_and_back, wrong, []) <= 1.0 - 0.7 * len(back) / len(blocks)
-    # recognised blocks need not fit
-    assert fitting(there_and_back, wrong, found_at(there_and_back, back.tolist(), 4)) >= len(back) / len(blocks)
-
-
-@pytest.mark.parametrize('axis', range(3))
-def test_block_fits_only_near_where_it_lies(there_and_back, monkeypatch, axis: int) -> None:
-    for farther, fits in ((0.9, True), (1.1, False)):
-        moved = farther * STAYS * np.eye(3)[axis]
-        monkeypatch.setattr(relocating, 'climbed', lambda *rest, moved=moved: compose(rest[2], moved))
-        monkeypatch.setattr(relocating, 'measure', lambda *rest: Match(rest[2], np.eye(3), np.inf))
-        assert fitting(there_and_back, there_and_back.windows.node, [], 1.0) == fits
-
-
-@pytest.mark.parametrize(('part', 'fits'), [(0.45, False), (0.55, True)])
-def test_half_of_the_usual_score_at_the_nearest_maximum_is_enough(there_and_back, monkeypatch, part, fits) -> None:
-    best = np.array([0.01, 0.02, 0.03])
-    monkeypatch.setattr(relocating, 'climbed', lambda *rest: compose(rest[2], best))
-
-    def measured(scan: Scan, around: LocalMap, pose: Floats, most: int) -> Match:
-        true = there_and_back.windows.node
-        # only blocks that are at their maximum
-        assert any(np.allclose(relative(true[place], compose(true[k], best)), pose) for k, place in pairs)
-        return Match(pose, np.eye(3), part * 1.5 * len(scan.readings))
-
-    nodes = there_and_back.windows.node
-    middles = [block * LENGTH + LENGTH // 2 for block in revisits(there_and_back.scans, nodes)]
-    pairs = [(min(k, len(nodes) - 1), place) for k in middles for place in range(0, k, SHARED)]
-    monkeypatch.setattr(relocating, 'measure', measured)
-    assert fitting(there_and_back, nodes, [], 1.5) == fits
-
-
-def test_blocks_with_few_readings_do_not_fit(there_and_back) -> None:
-    windows, scans = there_and_back.windows, there_and_back.scans
-    few = scans.with_held_out(np.zeros(len(windows), np.bool_))
-    few.count = np.full(len(windows), FEWEST_ON_MAP // LENGTH)
-    assert fitting_part(few, windows.node, [], 1.0, ignored) == 0.0
-    assert fitting_part(scans, windows.node, [], 0.0, ignored) == 0.0
-
-
-def test_all_blocks_fit_if_there_is_no_earlier_visit(there_and_back) -> None:
-    before = there_and_back.windows.node[: turning(there_and_back) // 4]
-    assert not len(revisits(there_and_back.scans, before))
-    assert fitting(there_and_back, before, [], 1.0) == 1.0
-
-
-@pytest.mark.parametrize('count', range(21, 25))
-def test_last_block_may_be_short(count: int) -> None:
-    """There and back on a line: the last block has 5 to 8 windows, and only the first place is a visit before it."""
-    along = np.minimum(np.arange(count), count - np.arange(count)) * 0.4
-    nodes = np.column_stack([along, np.zeros(count), np.zeros(count)])
-    windows = SimpleNamespace(node_progress=0.42 * np.arange(count))
-    scans = SimpleNamespace(windows=windows, count=np.full(count, 100), threads=1)
-    scans.map = lambda *rest: None
-    assert revisits(scans, nodes).tolist() == [2]
-    assert fitting_part(scans, nodes, [], 1.0, ignored) == 0.0
 
 
 @pytest.mark.parametrize('lost', [0, pytest.param(1, marks=pytest.mark.slow)])

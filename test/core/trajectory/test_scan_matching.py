@@ -247,9 +247,9 @@ def test_reason_says_that_the_robot_came_back_only_if_it_did(bent, scans, matche
     found = Refiner(Parameters())._at_any_angle(drive_of, by_walls(scans, recording, odometry), ACCURACY)
     assert not found.right_angles
     assert ('where the robot came back' in found.reason) == again
-    # no block fits
+    # none of the places is recognised
     assert found.reason.endswith(
-        '; only 0% of the path through places seen before fits their maps: the drive may be bent as a whole'
+        '; 0% of the path through places seen before is recognised: the drive may be bent as a whole'
     )
     told = told._replace(part=LEAST_RECOGNISED)
     found = Refiner(Parameters())._at_any_angle(drive_of, by_walls(scans, recording, odometry), ACCURACY)
