@@ -20,7 +20,7 @@ import numpy as np
 
 from ..common.errors import InputError
 from ..common.readings import Floats
-from .fitting import fitted
+from .fitting import gain_of_fitted
 from .holding_out import LEAST_SIGMAS, OTHERS, held_out
 from .judging import gain_of_objective
 from .loops import Loop
@@ -45,8 +45,8 @@ SCALE_STEP, LEAST_STEPS, MOST_STEPS = 1.03, 0.5, 5
 is noisy, and number of steps at which the search ends without a result."""
 
 WORTH_FITTING = 1.0
-"""Standard errors by which J must be larger at another scale for both trajectories to be fitted. It must be less than
-`LEAST_SIGMAS`; otherwise J is decisive without that."""
+"""If J is larger at another scale by this many standard errors, and by less than `LEAST_SIGMAS`, both trajectories are
+fitted before they are compared."""
 
 
 class MatchedDrive(NamedTuple):
@@ -213,9 +213,7 @@ def _scaled(found: MatchedDrive, watch: Progress) -> MatchedDrive:
     try:
         better = gain_of_objective(scans, nodes, scaled).sigmas
         if WORTH_FITTING <= better < LEAST_SIGMAS:
-            first = fitted(scans, nodes, lambda part: watch(part / 2))
-            second = fitted(scans, scaled, lambda part: watch((1.0 + part) / 2))
-            better = gain_of_objective(scans, first, second).sigmas
+            better = gain_of_fitted(scans, nodes, scaled, watch).sigmas
     except InputError:
         # between the scales that were tried, or after fitting, the map may be some cells larger
         return found

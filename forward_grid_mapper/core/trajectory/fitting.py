@@ -60,13 +60,24 @@ def gain_when_fitted(scans: Scans, before: Floats, after: Floats, watch: Progres
     better = gain_of_objective(scans, before, after)
     if better.sigmas < LEAST_SIGMAS:
         return better
-    first = fitted(scans, before, lambda part: watch(part / 2))
-    second = fitted(scans, after, lambda part: watch((1.0 + part) / 2))
     try:
-        return gain_of_objective(scans, first, second)
+        return gain_of_fitted(scans, before, after, watch)
     except InputError:
         # fitted trajectories may be some cells larger
         return better
+
+
+def gain_of_fitted(scans: Scans, before: Floats, after: Floats, watch: Progress = lambda part: None) -> Gain:
+    """Return the gain in J of `after` over `before` after both were fitted; the parameters are those above.
+
+    Raises
+    ------
+    InputError
+        If the map along one of the fitted trajectories is too large.
+    """
+    first = fitted(scans, before, lambda part: watch(part / 2))
+    second = fitted(scans, after, lambda part: watch((1.0 + part) / 2))
+    return gain_of_objective(scans, first, second)
 
 
 def fitted(scans: Scans, nodes: Floats, watch: Progress = lambda part: None) -> Floats:
