@@ -60,6 +60,9 @@ class ConsistencyCheck:
             return last.found
 
         def check() -> None:
+            if maps is not self._latest:
+                # there were later maps, or a reset, before it began
+                return
             found = consistency_warnings(maps.readings, mounts, maps.parameters)
             if not refined:
                 remedy = '' if maps.parameters.node.refine_poses else 'refine_poses'

@@ -11,7 +11,7 @@ from ..core.maps.map_set import MapSet
 from ..core.messages.message_types import Pose2
 from ..core.messages.pose_association import PoseAssociator
 from ..files.quality_warning import quality_warning
-from .background import Inbox, reason
+from .background import Inbox, Worker, reason
 from .consistency_check import ConsistencyCheck
 from .deferred import Reply
 from .distance import jump_warnings
@@ -110,7 +110,9 @@ class EmService:
         self._watched = self._logged = 0.0
         self._generation = 0
         self.worker = EmWorker(self._watch, logger.error, inbox.put, self._wait_for_kernels)
-        self._consistency = ConsistencyCheck(self.worker.worker, inbox)
+        # a check takes seconds and cannot be cancelled, and the next run must not wait for it
+        self.check_worker = Worker('consistency check', logger.error)
+        self._consistency = ConsistencyCheck(self.check_worker, inbox)
 
     @property
     def current(self) -> Run | None:
@@ -228,7 +230,8 @@ class EmService:
         self._consistency.forget()
 
     def close(self, seconds: float) -> None:
-        """Cancel the current run, and wait at most this many seconds for its end."""
+        """Cancel the current run, and wait at most this many seconds for its end; a check may go on after that."""
+        self.check_worker.close(0.0)
         self.worker.close(seconds)
 
     def _start(self, *callers: Callable[[Outcome], object]) -> Run:
@@ -255,9 +258,9 @@ class EmService:
             if outcome.maps is not None:
                 self._keep(outcome, outcome.maps, data.accepted)
                 return
-            self._report_failure(outcome)
             if run.map_shown:
                 self._publishers.publish('ml_map', generation, *before)
+            self._report_failure(outcome)
 
         def find_faults() -> list[str]:
             # with a refined trajectory, its own words say what became of jumps
@@ -308,8 +311,12 @@ class EmService:
     def _report_failure(self, outcome: Outcome) -> None:
         self.last_run = outcome.message
         text = outcome.message if outcome.message.startswith('EM ') else f'EM: {outcome.message}'
-        # a call that replaces a run of the node itself is no fault
-        (self._logger.info if outcome.replaced else self._logger.warning)(text)
+        # rclpy raises if one place in the code logs with two severities
+        if outcome.replaced:
+            # a call that replaces a run of the node itself is no fault
+            self._logger.info(text)
+        else:
+            self._logger.warning(text)
         if self.online:
             # maps that it made during EM were not published
             self.online.show()

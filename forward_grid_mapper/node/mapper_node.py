@@ -183,7 +183,8 @@ class MapperNode(ManagedNode):
         extrinsics = self._extrinsics
         self.journal = JournalKeeper(self, self.parameters.node.journal, self.associator, lambda: extrinsics.used)
         self.em.restored_mounts = lambda: self.journal.restored_mounts
-        self.workers = [self._readings_worker, self.live.worker, self.maps.worker, self.em.worker.worker]
+        em = self.em
+        self.workers = [self._readings_worker, self.live.worker, self.maps.worker, em.worker.worker, em.check_worker]
         self.workers += [part.worker for part in (self.saver, self.online, following, self.kernels) if part]
         health = Health()
         self.intake = Intake(self, self.parameters, self.associator, self._map_frame, health.taken)

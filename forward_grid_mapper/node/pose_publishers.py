@@ -87,6 +87,8 @@ class PosePublishers:
     def send(self, frames: tuple[str, str], correction: Floats, newest: tuple[int, Pose2], repeat: bool = True) -> None:
         """Send the transform, or the pose, if odometry or the correction is new, or to repeat it.
 
+        Without a name of the odometry frame there is no transform: every listener on TF would reject it with an error.
+
         Parameters
         ----------
         frames : (str, str)
@@ -110,6 +112,8 @@ class PosePublishers:
             stamp = sent_stamp + 1
         self._sent, self._due = (stamp, (x, y, yaw)), now + REPEAT
         map_frame, odom_frame = (frame.lstrip('/') for frame in frames)
+        if self._send is not None and not odom_frame:
+            return
         if self._send is not None:
             transform = TransformStamped(child_frame_id=odom_frame)
             transform.header.frame_id = map_frame

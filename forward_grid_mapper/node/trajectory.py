@@ -275,7 +275,10 @@ class Trajectory:
         """Return where the transform from map to odometry is published, in words."""
         if self._publishers is None or not self.in_map_frame or self.obstacle:
             return 'none: the maps are in the frame of odometry'
-        return 'on TF' if self._publishers.by_tf else 'none: tf2_ros is not installed'
+        if not self._publishers.by_tf:
+            return 'none: tf2_ros is not installed'
+        nameless = self._associator.record.newest is not None and not self._associator.map_frame.strip('/')
+        return 'none: odometry has no frame_id' if nameless else 'on TF'
 
     def _use_map_frame(self, on: bool) -> None:
         self.in_map_frame = on

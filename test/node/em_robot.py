@@ -175,8 +175,9 @@ class EmRobot:
             time.sleep(0.001)
 
     def settle(self) -> None:
-        """Turn the executor until EM and its worker are idle."""
-        self.until(lambda: self.em.current is None and not self.em.worker.worker.waiting)
+        """Turn the executor until EM and its workers are idle."""
+        em = self.em
+        self.until(lambda: em.current is None and not em.worker.worker.waiting and not em.check_worker.waiting)
         self.node.turn()
 
     def run_em(self) -> Answer:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Callable
 from typing import Any
 
@@ -42,14 +43,30 @@ class PlainNode:
         self.publishers = 1
         self.subscribed: dict[str, tuple[Callable[..., None], Any]] = {}
         self._guards: list[Guard] = []
+        self._severities: dict[tuple[str, int, int], str] = {}
 
     def get_logger(self) -> Any:
         return self
 
-    def warning(self, text: str) -> None:
-        self.warned.append(text)
+    def debug(self, text: str) -> None:
+        self._log('debug', text)
 
-    error = info = warning
+    def info(self, text: str) -> None:
+        self._log('info', text)
+
+    def warning(self, text: str) -> None:
+        self._log('warning', text)
+
+    def error(self, text: str) -> None:
+        self._log('error', text)
+
+    def _log(self, severity: str, text: str) -> None:
+        caller = sys._getframe(2)
+        place = caller.f_code.co_filename, caller.f_lineno, caller.f_lasti
+        if self._severities.setdefault(place, severity) != severity:
+            # as rclpy does
+            raise ValueError('Logger severity cannot be changed between calls.')
+        self.warned.append(text)
 
     def create_guard_condition(self, callback: Callable[[], None]) -> Guard:
         made = Guard(callback)

@@ -302,6 +302,58 @@ def test_failing_run_restores_the_earlier_map(make: Callable[..., EmRobot]) -> N
     assert robot.published[-1] == ('ml_map', 3, *BEFORE)
 
 
+def test_cancelled_run_restores_the_earlier_map_also_after_a_run_was_replaced(
+    make: Callable[..., EmRobot],
+) -> None:
+    # the end of a replaced run is logged with another severity than that of a cancelled one
+    robot = make(publish_rate=50.0)
+    robot.held = True
+    robot.em.run_by_itself()
+    robot.begun()
+    robot.accept(1)
+    robot.run_em()
+    robot.until(lambda: len(robot.searches) == 2)
+    robot.begun().go_on.set()
+    robot.settle()
+
+    def last_map() -> Any:
+        return [given[2:] for given in robot.published if given[0] == 'ml_map'][-1]
+
+    robot.publishers.ml_map = shown = last_map()
+    answer = robot.run_em()
+    search, run = robot.begun(), robot.em.current
+    assert run is not None and search.watch is not None
+    while not run.map_shown:
+        search.watch('search', PROGRESS)
+    robot.cancel_em()
+    robot.settle()
+    assert answer.sent == [(False, 'EM was cancelled by cancel_em')]
+    assert last_map() == shown != SO_FAR
+
+
+def test_run_begins_while_an_earlier_one_is_being_checked(held: EmRobot, monkeypatch: pytest.MonkeyPatch) -> None:
+    go_on, checking = threading.Event(), threading.Event()
+
+    def slow(*given: Any) -> list[str]:
+        checking.set()
+        assert go_on.wait(60.0)
+        return ['stamps are late']
+
+    monkeypatch.setattr(consistency_check, 'consistency_warnings', slow)
+    held.run_em()
+    held.begun().go_on.set()
+    held.until(checking.is_set)
+    held.until(lambda: held.em.current is None)
+    answer = held.run_em()
+    held.begun()
+    cancelled = held.cancel_em()
+    held.until(lambda: cancelled.sent)
+    assert answer.sent == [(False, 'EM was cancelled by cancel_em')] and held.em.wrong_input == []
+    go_on.set()
+    held.settle()
+    assert held.em.wrong_input == ['stamps are late']
+
+
 def test_intermediate_map_is_published_at_publish_rate(make: Callable[..., EmRobot]) -> None:
     robot = make(publish_rate=20.0)
     robot.held = True

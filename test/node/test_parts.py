@@ -127,7 +127,7 @@ def test_contradictory_poses_are_reported_after_the_response(
     robot.until(lambda: len(checked) == 2)
     robot.call(node.reset)
     go_on.set()
-    robot.until(lambda: not node.em.worker.worker.waiting)
+    robot.until(lambda: not node.em.check_worker.waiting)
     robot.executor.spin_once(timeout_sec=0.01)
     assert node.em.wrong_input == []
 

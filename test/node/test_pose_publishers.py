@@ -20,7 +20,7 @@ from inside import Inside
 from refined_robot import odometry_of
 from sensor_msgs.msg import MultiDOFJointState
 
-from forward_grid_mapper.core.messages.message_types import NANOSECONDS, Pose2
+from forward_grid_mapper.core.messages.message_types import NANOSECONDS, OdometryMessage, Pose2
 from forward_grid_mapper.core.trajectory.poses import compose
 from forward_grid_mapper.core.trajectory.windows import Odometry
 from forward_grid_mapper.node import graph_check, pose_publishers, trajectory
@@ -127,6 +127,21 @@ def test_transform_from_map_to_odom_is_published(
     robot.call(robot.node.reset)
     robot.drive(210, 1)
     robot.until(lambda: numbers(tf2_ros.sent[-1]) == (0.0, 0.0, 0.0))
+
+
+@pytest.mark.parametrize('frame', ['', '/'])
+def test_no_transform_without_a_name_of_the_odometry_frame(
+    inside: Callable[..., Inside], tf2_ros: type[Broadcaster], frame: str
+) -> None:
+    robot = inside(refine_poses=True)
+    robot.node.start()
+    robot.until(lambda: robot.node.mapping)
+    trajectory = robot.node.trajectory
+    assert robot.status('trajectory')['transform'] == 'on TF'
+    robot.node.associator.add_odometry(OdometryMessage(NANOSECONDS, frame, 'base_link', Pose2(0.0, 0.0, 0.0)))
+    trajectory._tick()
+    assert tf2_ros.sent == []
+    assert robot.status('trajectory')['transform'] == 'none: odometry has no frame_id'
 
 
 def mapping(inside: Callable[..., Inside], monkeypatch: pytest.MonkeyPatch) -> tuple[Inside, list[float]]:
