@@ -7,7 +7,8 @@ s_d = Π (1 − h) over the nearer rings
     p(z | map) = causes independent of the map
                  + (1 − p_rand − p_lost) · (Σ_d s_d h_d N(z; d, σ) + s_end N(z; z_max, σ))
 
-A surface that the sound meets beyond the incidence angle does not count if the reading is longer (`surface_normals`).
+A surface that the sound meets beyond the incidence angle does not count if the reading is longer (`surface_normals`). A
+surface that was seen from the other side only is unknown from this one (`sides`).
 The result is a likelihood ratio to a map without known cells, so that new territory counts nothing.
 """
 
@@ -26,6 +27,7 @@ from ..runtime.jit import inlined_kernel, kernel
 from ..sensor.cone_table import effective_sigma, reach_of
 from ..sensor.density import CUT, causes_of, density
 from .local_map import LocalMap
+from .sides import BEHIND
 
 RAYS = (3, 5, 7, 11)
 """Numbers of rays through a cone, the middle one along its axis: as many as needed to be at most a cell apart, 11 at
@@ -139,7 +141,7 @@ class Lanes(NamedTuple):
         s_d, and Σ s_d h_d N(z; d, σ).
     cell : int32, shape (RAYS[-1], L)
         The cell that each ray meets in the current ring: index of a row of `LocalMap.cells`.
-    met : float32, shape (RAYS[-1], 3, L)
+    met : float32, shape (RAYS[-1], 5, L)
         The values of that row.
     """
 
@@ -157,7 +159,7 @@ class Lanes(NamedTuple):
 def _lanes(count: int) -> Lanes:
     x, y, best, ray, survival, hit = np.zeros((6, count))
     fan = np.zeros((1 + len(RAYS), RAYS[-1], 2, count))
-    cell, met = np.zeros((RAYS[-1], count), np.int32), np.zeros((RAYS[-1], 3, count), np.float32)
+    cell, met = np.zeros((RAYS[-1], count), np.int32), np.zeros((RAYS[-1], 5, count), np.float32)
     return Lanes(x, y, fan, best, ray, survival, hit, cell, met)
 
 
@@ -193,6 +195,7 @@ def _meet(around: LocalMap, lanes: Lanes, wide: int, rays: int, d: float) -> Non
         for p in range(len(x)):
             at = np.uint32(cell[k, p])
             met[k, 0, p], met[k, 1, p], met[k, 2, p] = cells[at, 0], cells[at, 1], cells[at, 2]
+            met[k, 3, p], met[k, 4, p] = cells[at, 3], cells[at, 4]
 
 
 @inlined_kernel
@@ -206,7 +209,9 @@ def _raise(around: LocalMap, lanes: Lanes, wide: int, rays: int, limit: float) -
         for p in range(len(best)):
             # without a normal `along` is NaN, and the comparison is false
             along = fan[wide, k, 0, p] * met[k, 1, p] + fan[wide, k, 1, p] * met[k, 2, p]
-            here = 0.0 if along * along < limit else np.float64(met[k, 0, p])
+            seen = fan[wide, k, 0, p] * met[k, 3, p] + fan[wide, k, 1, p] * met[k, 4, p]
+            here = unknown if seen < BEHIND else np.float64(met[k, 0, p])
+            here = 0.0 if along * along < limit else here
             beyond = cell[k, p] == outside
             here = unknown if beyond else here
             more = here > best[p]

@@ -24,6 +24,7 @@ from ..runtime.memory import memory_for_pairs
 from ..search.search import Search, SearchResult
 from ..sensor.cone_table import grid_of
 from ..sensor.density import hit_probability
+from .sides import mean_bearings
 
 OCCUPIED, FREE = 1 / (1 + math.exp(-3.0)), 1 / (1 + math.exp(4.0))
 """Probabilities of occupied and of free cells of a local map."""
@@ -56,9 +57,10 @@ class LocalMap(NamedTuple):
         Metres.
     shape : int, int
         Rows and columns.
-    cells : float32, shape (rows * columns + 1, 3)
-        Probability that a cell returns an echo if the sound reaches it, and the unit vector of its surface normal
-        (`SurfaceNormals`), NaN if unknown. The last row stands for all cells outside.
+    cells : float32, shape (rows * columns + 1, 5)
+        Probability that a cell returns an echo if the sound reaches it; the unit vector of its surface normal
+        (`SurfaceNormals`), NaN if unknown; and the mean bearing from which it was seen, 0 if from both sides (`sides`).
+        The last row stands for all cells outside.
     cos2_limit : float
         As in `surface_normals.SurfaceNormals`.
     unknown : float
@@ -74,12 +76,15 @@ class LocalMap(NamedTuple):
     unknown: float
 
 
-def cells_of(hit: NDArray[np.float32], x: NDArray[np.float32], y: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Return `LocalMap.cells`; the normals (x, y) are 0 if unknown."""
-    out = np.full((hit.size + 1, 3), np.nan, np.float32)
+def cells_of(
+    hit: NDArray[np.float32], x: NDArray[np.float32], y: NDArray[np.float32], seen_along: NDArray[np.float32]
+) -> NDArray[np.float32]:
+    """Return `LocalMap.cells`; the normals (x, y) are 0 if unknown, and `seen_along`, shape (2, cells), has the rest."""
+    out = np.full((hit.size + 1, 5), np.nan, np.float32)
     out[:-1, 0] = hit.ravel()
     known = (x.ravel() != 0) | (y.ravel() != 0)
     out[:-1, 1], out[:-1, 2] = (np.where(known, each.ravel(), np.float32(np.nan)) for each in (x, y))
+    out[:-1, 3:], out[-1, 3:] = seen_along.T, 0.0
     return out
 
 
@@ -141,12 +146,14 @@ def soft_map(evidence: Evidence, grid: Grid, traversed: NDArray[np.bool_], model
     shown = np.where(ml == 1, OCCUPIED, np.where((ml == 0) | traversed, FREE, UNKNOWN))
     hit = (shown * p_hit).astype(np.float32)
     x, y = (normals.x, normals.y) if len(normals.known) else np.zeros((2, hit.size), np.float32)
+    cones = evidence.state.cones[: len(evidence)]
+    seen_along = mean_bearings(cones, grid.shape, ml.ravel() == 1, evidence.state.stop)
     return LocalMap(
         float(grid.column),
         float(grid.row),
         grid.resolution,
         grid.shape,
-        cells_of(hit, x, y),
+        cells_of(hit, x, y, seen_along),
         normals.cos2_limit,
         UNKNOWN * p_hit,
     )
