@@ -27,7 +27,6 @@ from ..runtime.jit import inlined_kernel, kernel
 from ..sensor.cone_table import effective_sigma, reach_of
 from ..sensor.density import CUT, causes_of, density
 from .local_map import LocalMap
-from .sides import BEHIND
 
 RAYS = (3, 5, 7, 11)
 """Numbers of rays through a cone, the middle one along its axis: as many as needed to be at most a cell apart, 11 at
@@ -141,7 +140,7 @@ class Lanes(NamedTuple):
         s_d, and Σ s_d h_d N(z; d, σ).
     cell : int32, shape (RAYS[-1], L)
         The cell that each ray meets in the current ring: index of a row of `LocalMap.cells`.
-    met : float32, shape (RAYS[-1], 5, L)
+    met : float32, shape (RAYS[-1], 4, L)
         The values of that row.
     """
 
@@ -159,7 +158,7 @@ class Lanes(NamedTuple):
 def _lanes(count: int) -> Lanes:
     x, y, best, ray, survival, hit = np.zeros((6, count))
     fan = np.zeros((1 + len(RAYS), RAYS[-1], 2, count))
-    cell, met = np.zeros((RAYS[-1], count), np.int32), np.zeros((RAYS[-1], 5, count), np.float32)
+    cell, met = np.zeros((RAYS[-1], count), np.int32), np.zeros((RAYS[-1], 4, count), np.float32)
     return Lanes(x, y, fan, best, ray, survival, hit, cell, met)
 
 
@@ -195,7 +194,7 @@ def _meet(around: LocalMap, lanes: Lanes, wide: int, rays: int, d: float) -> Non
         for p in range(len(x)):
             at = np.uint32(cell[k, p])
             met[k, 0, p], met[k, 1, p], met[k, 2, p] = cells[at, 0], cells[at, 1], cells[at, 2]
-            met[k, 3, p], met[k, 4, p] = cells[at, 3], cells[at, 4]
+            met[k, 3, p] = cells[at, 3]
 
 
 @inlined_kernel
@@ -207,10 +206,9 @@ def _raise(around: LocalMap, lanes: Lanes, wide: int, rays: int, limit: float) -
     for k in range(rays):
         this = float(k)
         for p in range(len(best)):
-            # without a normal `along` is NaN, and the comparison is false
+            # without a vector `along` is NaN, and the comparisons are false
             along = fan[wide, k, 0, p] * met[k, 1, p] + fan[wide, k, 1, p] * met[k, 2, p]
-            seen = fan[wide, k, 0, p] * met[k, 3, p] + fan[wide, k, 1, p] * met[k, 4, p]
-            here = unknown if seen < BEHIND else np.float64(met[k, 0, p])
+            here = unknown if along < met[k, 3, p] else np.float64(met[k, 0, p])
             here = 0.0 if along * along < limit else here
             beyond = cell[k, p] == outside
             here = unknown if beyond else here

@@ -24,7 +24,7 @@ from ..runtime.memory import memory_for_pairs
 from ..search.search import Search, SearchResult
 from ..sensor.cone_table import grid_of
 from ..sensor.density import hit_probability
-from .sides import mean_bearings
+from .sides import BEHIND, mean_bearings
 
 OCCUPIED, FREE = 1 / (1 + math.exp(-3.0)), 1 / (1 + math.exp(4.0))
 """Probabilities of occupied and of free cells of a local map."""
@@ -42,6 +42,9 @@ surfaces have the same limit of the incidence angle: learned limits discard read
 worse."""
 
 
+LONG = np.float32(1000.0)
+"""Length of the mean bearing in place of a normal: so long that no ray is beyond the incidence angle."""
+
 OF_LOCAL_MAPS = 1e9
 """Memory limit for the pairs of a local map, bytes; never reached."""
 
@@ -57,9 +60,10 @@ class LocalMap(NamedTuple):
         Metres.
     shape : int, int
         Rows and columns.
-    cells : float32, shape (rows * columns + 1, 5)
-        Probability that a cell returns an echo if the sound reaches it; the unit vector of its surface normal
-        (`SurfaceNormals`), NaN if unknown; and the mean bearing from which it was seen, 0 if from both sides (`sides`).
+    cells : float32, shape (rows * columns + 1, 4)
+        Probability that a cell returns an echo if the sound reaches it; a vector v; and a number f. Rays along the unit
+        vector r come from behind the surface if r · v < f (`sides`), and are beyond the incidence angle if (r · v)² is
+        less than `cos2_limit`. v is the surface normal (`SurfaceNormals`), or NaN if there is nothing to compare with.
         The last row stands for all cells outside.
     cos2_limit : float
         As in `surface_normals.SurfaceNormals`.
@@ -77,14 +81,24 @@ class LocalMap(NamedTuple):
 
 
 def cells_of(
-    hit: NDArray[np.float32], x: NDArray[np.float32], y: NDArray[np.float32], seen_along: NDArray[np.float32]
+    hit: NDArray[np.float32], x: NDArray[np.float32], y: NDArray[np.float32], bearing: NDArray[np.float32]
 ) -> NDArray[np.float32]:
-    """Return `LocalMap.cells`; the normals (x, y) are 0 if unknown, and `seen_along`, shape (2, cells), has the rest."""
-    out = np.full((hit.size + 1, 5), np.nan, np.float32)
-    out[:-1, 0] = hit.ravel()
-    known = (x.ravel() != 0) | (y.ravel() != 0)
-    out[:-1, 1], out[:-1, 2] = (np.where(known, each.ravel(), np.float32(np.nan)) for each in (x, y))
-    out[:-1, 3:], out[-1, 3:] = seen_along.T, 0.0
+    """Return `LocalMap.cells`.
+
+    Parameters
+    ----------
+    hit, x, y : float32, shape (rows, columns)
+        Probabilities, and normals with either sign; 0 if unknown.
+    bearing : float32, shape (2, rows * columns)
+        From `sides.mean_bearings`.
+    """
+    normal = np.stack([x.ravel(), y.ravel()])
+    known, one_sided = normal.any(0), bearing.any(0)
+    away = np.where((normal * bearing).sum(0) < 0.0, -normal, normal)
+    vector = np.where(known, away, np.where(one_sided, LONG * bearing, np.float32(np.nan)))
+    out = np.full((hit.size + 1, 4), np.nan, np.float32)
+    out[:-1, 0], out[:-1, 1:3] = hit.ravel(), vector.T
+    out[:-1, 3] = np.where(one_sided, np.where(known, 0.0, LONG * BEHIND), -np.inf)
     return out
 
 
@@ -147,13 +161,13 @@ def soft_map(evidence: Evidence, grid: Grid, traversed: NDArray[np.bool_], model
     hit = (shown * p_hit).astype(np.float32)
     x, y = (normals.x, normals.y) if len(normals.known) else np.zeros((2, hit.size), np.float32)
     cones = evidence.state.cones[: len(evidence)]
-    seen_along = mean_bearings(cones, grid.shape, ml.ravel() == 1, evidence.state.stop)
+    bearing = mean_bearings(cones, grid.shape, ml.ravel() == 1, evidence.state.stop)
     return LocalMap(
         float(grid.column),
         float(grid.row),
         grid.resolution,
         grid.shape,
-        cells_of(hit, x, y, seen_along),
+        cells_of(hit, x, y, bearing),
         normals.cos2_limit,
         UNKNOWN * p_hit,
     )

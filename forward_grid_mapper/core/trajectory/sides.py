@@ -22,8 +22,8 @@ ONE_SIDE = 0.5
 sides, bearings cancel."""
 
 BEHIND = math.cos(math.radians(120.0))
-"""Rays come from behind such a surface if the cosine of their angle to the mean bearing is smaller. The mean bearing may
-be 45° off the normal, and rays may meet the surface at 75°."""
+"""Where the normal is unknown, rays come from behind such a surface if the cosine of their angle to the mean bearing is
+smaller: this may be 45° off the normal, and rays may meet the surface at 75°."""
 
 FARTHEST = 4.0
 """Echoes whose range differs from the distance of a cell by more σ do not come from it."""

@@ -22,7 +22,6 @@ from forward_grid_mapper.core.trajectory.likelihood import (
 from forward_grid_mapper.core.trajectory.local_map import UNKNOWN, LocalMap, at_poses, cells_of, local_map
 from forward_grid_mapper.core.trajectory.matching import CURVED, grid_around, measure
 from forward_grid_mapper.core.trajectory.poses import compose
-from forward_grid_mapper.core.trajectory.sides import BEHIND
 from forward_grid_mapper.simulation.drive import drive
 from forward_grid_mapper.simulation.sonar import NOISY, sonar_ring
 from forward_grid_mapper.simulation.world import rooms_world
@@ -38,8 +37,8 @@ def made_map(seed: int, normals: bool) -> LocalMap:
     known = (rng.random(hit.shape) < 0.5) & normals
     x, y = (np.where(known, f(angle), 0).astype(np.float32) for f in (np.cos, np.sin))
     bearing, limit = rng.uniform(-math.pi, math.pi, hit.size), math.cos(0.7) ** 2 if normals else 0.0
-    seen_along = np.where(rng.random(hit.size) < 0.5, [np.cos(bearing), np.sin(bearing)], 0.0).astype(np.float32)
-    return LocalMap(-25.0, -20.0, 0.1, hit.shape, cells_of(hit, x, y, seen_along), limit, NOTHING)
+    seen = np.where(rng.random(hit.size) < 0.5, [np.cos(bearing), np.sin(bearing)], 0.0).astype(np.float32)
+    return LocalMap(-25.0, -20.0, 0.1, hit.shape, cells_of(hit, x, y, seen), limit, NOTHING)
 
 
 def made_readings(seed: int, count: int = 30) -> Readings:
@@ -82,9 +81,9 @@ def log_likelihood(readings: Readings, t: int, around: LocalMap | None, pose: tu
                 column = math.floor((x + d * math.cos(bearing)) / 0.1 - around.column)
                 row = math.floor((y + d * math.sin(bearing)) / 0.1 - around.row)
                 if 0 <= row < around.shape[0] and 0 <= column < around.shape[1]:
-                    here, *n, seen_x, seen_y = around.cells[row * around.shape[1] + column].tolist()
+                    here, *n, least = around.cells[row * around.shape[1] + column].tolist()
                     along = math.cos(bearing) * n[0] + math.sin(bearing) * n[1]
-                    if math.cos(bearing) * seen_x + math.sin(bearing) * seen_y < BEHIND:
+                    if along < least:
                         here = NOTHING
                     if d < z - 2 * sigma and not any(np.isnan(n)) and along * along < around.cos2_limit:
                         here = 0.0

@@ -14,7 +14,7 @@ from forward_grid_mapper.core.common.readings import Readings
 from forward_grid_mapper.core.runtime.cancelling import NEVER
 from forward_grid_mapper.core.sensor.cone_table import cone_table
 from forward_grid_mapper.core.trajectory import sides
-from forward_grid_mapper.core.trajectory.local_map import for_matching, local_map
+from forward_grid_mapper.core.trajectory.local_map import cells_of, for_matching, local_map
 from forward_grid_mapper.core.trajectory.loops import LENGTH, Places, find_loop
 from forward_grid_mapper.core.trajectory.passes import match_preceding
 from forward_grid_mapper.core.trajectory.pose_graph import residuals
@@ -132,4 +132,24 @@ def test_local_map_knows_the_side_of_most_walls(shelf: Scans) -> None:
     first = windows.readings.select(np.flatnonzero(windows.readings.y < 2.2))
     made = local_map(first, for_matching(Parameters()), NEVER.copy())
     surfaces = made.cells[:-1][made.cells[:-1, 0] > 0.5]
-    assert len(surfaces) > 100 and (np.hypot(*surfaces[:, 3:].T) > 0.5).mean() > 0.9
+    assert len(surfaces) > 100 and np.isfinite(surfaces[:, 3]).mean() > 0.9
+
+
+@pytest.mark.parametrize('normal', [None, 0.3, -0.3, 0.3 + math.pi])
+def test_rays_from_behind_meet_an_unknown_surface(normal: float | None) -> None:
+    """The surface was seen along the x axis."""
+    x, y = (0.0, 0.0) if normal is None else (math.cos(normal), math.sin(normal))
+    hit, x, y = (np.full((1, 2), value, np.float32) for value in (0.7, x, y))
+    cells = cells_of(hit, x, y, np.array([[1.0, 0.0], [0.0, 0.0]], np.float32))
+
+    def product(cell: int, angle: float) -> float:
+        return float(cells[cell, 1:3] @ (math.cos(angle), math.sin(angle)))
+
+    assert all(product(0, angle) > cells[0, 3] for angle in np.radians([-70, 0, 70]))
+    assert all(product(0, angle) < cells[0, 3] for angle in np.radians([130, 180, 230]))
+    if normal is None:
+        # no ray is beyond the incidence angle
+        assert all(product(0, angle) ** 2 > 1.0 for angle in np.radians([0, 45, 89, 100, 180]))
+    # the other surface was seen from both sides, and cells outside are unknown
+    for cell in (1, -1):
+        assert not any(product(cell, angle) < cells[cell, 3] for angle in np.radians([0, 90, 180, 270]))
