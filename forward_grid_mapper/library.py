@@ -21,7 +21,7 @@ from .core.messages.extrinsics import Mount
 from .core.messages.message_types import NANOSECONDS, OdometryMessage, Pose2, RangeMessage
 from .core.messages.mounts import FARTHEST_MOUNT, more_than_a_turn
 from .core.messages.pose_association import PoseAssociator
-from .core.messages.rep117 import REASONS, odometry_rejections, rejection_warnings, sensor_rejections
+from .core.messages.rep117 import REASONS, odometry_rejections, of_dead_sensors, rejection_warnings, sensor_rejections
 from .files.pose_files import poses_from_csv, poses_from_tum
 from .files.quality_warning import data_warnings
 from .files.results import write_results
@@ -217,14 +217,15 @@ def make_maps(
             f'{stamps.min() / 1e9:.3f} … {stamps.max() / 1e9:.3f} s'
         )
     maps = live.on(Mapper(chosen).run(associator.readings, watch))
+    by_frame, counts = associator.rejected_by_frame, associator.buffer.counts()
     before = [
         *_of_the_node(chosen),
         *arrays.ambiguous_stamps(odometry),
         *alternation_note(associator),
         *refused,
         *associator.message_warnings(),
-        *rejection_warnings(associator.rejected, len(values), 'ranges'),
-        *sensor_rejections(associator.rejected_by_frame, associator.buffer.counts()),
+        *rejection_warnings(associator.rejected, len(values), 'ranges', dead=of_dead_sensors(by_frame, counts)),
+        *sensor_rejections(by_frame, counts),
         *thinning_note(associator),
     ]
     judged = tuple(data_warnings(maps, {'extrinsics': mounted}))

@@ -71,7 +71,6 @@ ALLOWED = {
     'raw': 'a mode of map_server',
     '/robot1/forward_grid_mapper/run_em': 'a service of a node in a namespace',
     'mkdocs serve': 'a command of mkdocs',
-    "pip install --break-system-packages 'rosbags>=0.11.9,<0.12'": 'a command of pip',
     'tasks.csv': 'a file that process_bag writes',
     'maps.zarr': 'a folder that process_bag writes',
     'index.json': 'a file that process_bag writes',
@@ -80,6 +79,7 @@ ALLOWED = {
     'maps.work': 'a folder that process_bag makes',
     'bokeh': 'a package that Dask draws its dashboard with',
     'kill -9': 'a command of every shell',
+    'python3-pip': 'a package of Ubuntu',
 }
 """Words in code spans that are no names of the repository, with the reason why they are allowed."""
 

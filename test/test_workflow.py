@@ -48,9 +48,11 @@ def test_workflow_installs_and_builds_like_the_readme(job: dict[str, Any]) -> No
     readme = (ROOT / 'README.md').read_text(encoding='utf-8')
     lines = [
         shlex.split(line)
-        for line in re.findall(r'^    ((?:rosdep install|colcon build|source install).*)$', readme, re.M)
+        for line in re.findall(
+            r'^    ((?:rosdep install|pip install --break|colcon build|source install).*)$', readme, re.M
+        )
     ]
-    assert len(lines) >= 2
+    assert len(lines) >= 4
     assert all(line in commands(job) for line in lines if line != ['source', 'install/setup.bash'])
     # the package is in the folder given in the README
     (checkout,) = (step['with'] for step in job['steps'] if 'uses' in step)
@@ -65,6 +67,10 @@ def test_commands_of_the_workflow_are_installed(job: dict[str, Any]) -> None:
     assert launched and all((ROOT / 'launch' / name).is_file() for name in launched)
 
 
-def test_rosbags_version_is_that_of_setup(job: dict[str, Any]) -> None:
-    (wanted,) = (word for line in commands(job) for word in line if word.startswith('rosbags'))
-    assert wanted in (ROOT / 'setup.py').read_text(encoding='utf-8')
+def test_pip_installs_the_keys_that_rosdep_skips_in_the_versions_of_setup(job: dict[str, Any]) -> None:
+    (skipped,) = (line[-1].split() for line in commands(job) if line[:2] == ['rosdep', 'install'])
+    (wanted,) = (line[3:] for line in commands(job) if line[:2] == ['pip', 'install'])
+    assert [re.split('[<>]', each)[0] for each in wanted] == [
+        key.removeprefix('python3-').removesuffix('-pip') for key in skipped
+    ]
+    assert all(each in (ROOT / 'setup.py').read_text(encoding='utf-8') for each in wanted)

@@ -90,7 +90,8 @@ def _halves(maps: MapSet, source: Mapping[str, Any]) -> tuple[float | None, str]
         return None, ''
     contradiction = contradiction_of_halves(maps)
     option = '--refine-poses' if source.get('bag') else 'refine_poses'
-    return contradiction, halves_warning(contradiction, '' if trajectory else option)
+    # a trajectory that was only calibrated has no reason
+    return contradiction, halves_warning(contradiction, '' if trajectory.get('reason') else option)
 
 
 def write_report(folder: Path | str, data: dict[str, Any]) -> None:

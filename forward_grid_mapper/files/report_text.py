@@ -212,7 +212,8 @@ def _result(data: dict[str, Any]) -> Iterator[str]:
     if (unexplained := result.get('unexplained')) is not None:
         share = _share(unexplained, readings)
         are = 'is most likely a random measurement' if unexplained == 1 else 'are most likely random measurements'
-        sought = any(source.get('trajectory') for source in (data.get('input') or {}, *(data.get('drives') or [])))
+        paths = [source.get('trajectory') or {} for source in (data.get('input') or {}, *(data.get('drives') or []))]
+        sought = any(path.get('refined') or path.get('reason') for path in paths)
         rows = (data.get('sensors') or {}).values()
         silent = sum(row.get('no_echo') or 0 for row in rows)
         # readings without an echo are hardly ever random measurements, and some sensors have few echoes

@@ -22,7 +22,14 @@ from ..core.messages.message_batch import batch_of
 from ..core.messages.message_types import NANOSECONDS, Pose2
 from ..core.messages.mounts import far_mounts
 from ..core.messages.pose_association import PoseAssociator
-from ..core.messages.rep117 import ODOMETRY_REASONS, REASONS, odometry_rejections, rejection_warnings, sensor_rejections
+from ..core.messages.rep117 import (
+    ODOMETRY_REASONS,
+    REASONS,
+    odometry_rejections,
+    of_dead_sensors,
+    rejection_warnings,
+    sensor_rejections,
+)
 from ..files.journal import drive_file
 from ..files.output_folder import readable
 from .bag_extrinsics import BagExtrinsics
@@ -202,8 +209,10 @@ def _warnings(bag: Bag, associator: PoseAssociator, lookup: BagExtrinsics) -> li
     warnings += associator.message_warnings()
     warnings += odometry_rejections(associator.odometry_rejected, associator.odometry_received)
     known = {'unknown_extrinsics', STEEP} if lookup.steep else {'unknown_extrinsics'}
-    warnings += rejection_warnings(associator.rejected, associator.received, known=known)
-    return warnings + sensor_rejections(associator.rejected_by_frame, associator.buffer.counts(), known)
+    by_frame, counts = associator.rejected_by_frame, associator.buffer.counts()
+    dead = of_dead_sensors(by_frame, counts)
+    warnings += rejection_warnings(associator.rejected, associator.received, known=known, dead=dead)
+    return warnings + sensor_rejections(by_frame, counts, known)
 
 
 def _base_frame(bag: Bag) -> str:

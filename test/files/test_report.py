@@ -122,7 +122,8 @@ def test_many_random_readings_give_a_hint_to_refine_poses() -> None:
         (50, {}, 'refine_poses'),
         (50, {'bag': 'monday'}, '--refine-poses'),
         (20, {}, None),
-        (50, {'trajectory': {'refined': False}}, None),
+        (50, {'trajectory': {'refined': False, 'reason': 'it is short'}}, None),
+        (50, {'trajectory': {'refined': False, 'reason': ''}}, 'refine_poses'),
     ):
         some = dataclasses.replace(maps, unexplained=np.arange(200) < part)
         text = ' '.join(report_text(report_data(some, source)).split())
@@ -139,7 +140,13 @@ def test_many_random_readings_give_a_hint_to_refine_poses() -> None:
     [
         (20, 0.06, {'bag': 'monday'}, 'jumps (--refine-poses corrects this), the robot was carried'),
         (80, 0.06, {}, 'jumps (refine_poses corrects this), the robot was carried'),
-        (20, 0.06, {'trajectory': {'refined': False}}, 'jumps (no better trajectory was found), the robot was carried'),
+        (
+            20,
+            0.06,
+            {'trajectory': {'refined': False, 'reason': 'it is short'}},
+            'jumps (no better trajectory was found)',
+        ),
+        (20, 0.06, {'trajectory': {'refined': False, 'reason': ''}}, 'jumps (refine_poses corrects this)'),
         (20, 0.02, {}, ''),
         (5, 0.06, {}, None),
         (20, 0.06, {'trajectory': {'refined': True}}, None),

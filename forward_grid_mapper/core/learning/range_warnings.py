@@ -39,12 +39,13 @@ readings have one."""
 LEAST_ECHOES = 200
 """Fewest echoes for checks of the range limit."""
 
-SENTINEL_SHARE, BEYOND_SHARE = 0.05, 0.005
+SENTINEL_SHARE, BEYOND_SHARE, OF_SENTINEL = 0.05, 0.005, 0.05
 """A sentinel is a certain range that a driver sends for 'no echo'. At least the first fraction of the echoes has this
-range, and at most the second fraction is longer (or shorter, if it is the shortest)."""
+range, and at most the second fraction is longer (or shorter, if it is the shortest), or the third fraction of those at
+the sentinel: the more readings are without an echo, the more random ones there are beyond it."""
 
 MOST_NO_ECHO = 0.01
-"""With a sentinel, at most this fraction of the readings has no echo."""
+"""With a sentinel, at most this fraction of the readings of a sensor has no echo."""
 
 VALUE_TOLERANCE = 0.0005
 """Metres within which two ranges are the same value of the driver."""
@@ -76,19 +77,23 @@ def sensors(readings: Readings) -> Iterable[tuple[str, Readings]]:
 
 def _high_sentinel(readings: Readings) -> str:
     """Check for a sentinel below max_range: the longest range, which occurs again and again."""
-    heard, towards = _echoes_if_no_reading_lacks_one(readings)
+    heard, towards = _of_sensors_that_always_hear(readings)
     if len(heard) < LEAST_ECHOES:
         return ''
-    longest = round(float(np.quantile(heard, 1.0 - BEYOND_SHARE)), 3)
+    values, counts = np.unique(heard.round(3), return_counts=True)
+    longest = float(values[counts.argmax()])
     same = np.abs(heard - longest) < VALUE_TOLERANCE
     nearly = (heard > longest - GAP_BELOW) & (heard < longest) & ~same
     count, almost = int(np.count_nonzero(same)), int(np.count_nonzero(nearly))
+    longer = int(np.count_nonzero(heard >= longest + VALUE_TOLERANCE))
+    if longer > max(BEYOND_SHARE * len(heard), OF_SENTINEL * count):
+        return ''
     if count < SENTINEL_SHARE * len(heard) or count < 2 * almost or not _all_around(towards[same]):
         return ''
     return (
-        f'{count / len(heard):.0%} of the echoes are at {longest:.3f} m, hardly any is longer, and no reading is '
-        'without an echo: does the driver send this range if there is no echo? Then set the parameter max_range to '
-        f'{0.98 * longest:.2g}, otherwise a wall is mapped at that range'
+        f'{count / len(heard):.0%} of the echoes are at {longest:.3f} m, hardly any is longer, and '
+        f'{_which(readings, longest)} is without an echo: does the driver send this range if there is no echo? Then set '
+        f'the parameter max_range to {0.98 * longest:.2g}, otherwise a wall is mapped at that range'
     )
 
 
@@ -115,11 +120,41 @@ def _low_sentinel(readings: Readings) -> str:
     )
 
 
+def _of_sensors_that_always_hear(readings: Readings) -> tuple[Floats, Floats]:
+    """Return ranges and directions, radians, of the echoes of such sensors while the robot moves.
+
+    Sensors with a constant range are left out: they hear a part of the robot.
+    """
+    # during a standstill ranges are constant
+    each = (mine.select(moving(mine)) for _, mine in sensors(readings) if _always_hears(mine))
+    parts = [mine.select(mine.echo) for mine in each if len(mine) and np.ptp(mine.z) > GAP_BELOW]
+    if not parts:
+        return np.zeros(0), np.zeros(0)
+    return np.concatenate([mine.z for mine in parts]), np.concatenate([mine.yaw for mine in parts])
+
+
+def _which(readings: Readings, value: float) -> str:
+    """Return the readings of which none is without an echo, in words: all, or those of sensors that send a value."""
+    if _always_hears(readings):
+        return 'no reading'
+    names = [
+        name
+        for name, mine in sensors(readings)
+        if _always_hears(mine) and np.mean(np.abs(mine.z - value) < VALUE_TOLERANCE) >= SENTINEL_SHARE
+    ]
+    return f'no reading of {", ".join(names[:8])}{f" and {len(names) - 8} more" * (len(names) > 8)}'
+
+
+def _always_hears(mine: Readings) -> bool:
+    """Return whether hardly any reading of a sensor is without an echo."""
+    return bool(np.count_nonzero(~mine.echo) <= MOST_NO_ECHO * len(mine))
+
+
 def _echoes_if_no_reading_lacks_one(readings: Readings) -> tuple[Floats, Floats]:
     """Return ranges and directions, radians, of the echoes while the robot moves; none if readings have no echo."""
     # during a standstill ranges are constant
     parts = [mine.select(mine.echo & moving(mine)) for _, mine in sensors(readings)]
-    if not parts or np.count_nonzero(~readings.echo) > MOST_NO_ECHO * len(readings):
+    if not parts or not _always_hears(readings):
         return np.zeros(0), np.zeros(0)
     return np.concatenate([mine.z for mine in parts]), np.concatenate([mine.yaw for mine in parts])
 

@@ -32,6 +32,7 @@ from .rep117 import (
     Measurement,
     measure,
     odometry_rejections,
+    of_dead_sensors,
     rejection_warnings,
     sensor_rejections,
     swapped_frames,
@@ -175,10 +176,11 @@ class PoseAssociator(MessageAccount):
 
     def rejection_warnings(self) -> list[str]:
         """Return warnings about the readings and poses that were rejected so far; empty if they are few."""
+        by_frame, counts = self.rejected_by_frame, self.buffer.counts()
         return [
             *odometry_rejections(self.odometry_rejected, self.odometry_received, MANY_REJECTED),
-            *rejection_warnings(self.rejected, self.received),
-            *sensor_rejections(self.rejected_by_frame, self.buffer.counts()),
+            *rejection_warnings(self.rejected, self.received, dead=of_dead_sensors(by_frame, counts)),
+            *sensor_rejections(by_frame, counts),
         ]
 
     def add_range(self, message: RangeMessage, sent: int = 0) -> None:

@@ -29,7 +29,8 @@ _BROKEN = (
 REASONS = {
     'nan_range': f'the range is not a number; {_SILENT_DRIVER}',
     'too_near': 'the range is -inf, or less than a millimetre: an object is too near to measure, or the sensor is '
-    f'dead; {_SILENT_DRIVER}',
+    f'dead; {_SILENT_DRIVER}. -inf always means that an object is too near: if the driver sends it without an echo, '
+    'correct the driver',
     'below_min_range': f'the range is below min_range; {_SILENT_DRIVER}',
     'over_range': 'no echo, and over_range is "discard"',
     'bad_limits': 'min_range or max_range is negative or not finite, or max_range is not above min_range, or below a '
@@ -200,18 +201,43 @@ def _offset(parameters: AssociationParameters) -> int:
 
 
 def rejection_warnings(
-    rejected: Mapping[str, int], received: int, what: str = 'readings', known: Container[str] = ()
+    rejected: Mapping[str, int],
+    received: int,
+    what: str = 'readings',
+    known: Container[str] = (),
+    dead: Mapping[str, int] | None = None,
 ) -> list[str]:
     """Return a warning for each reason, other than known ones, for which many of the readings were rejected.
 
-    Those that came during a pause do not count.
+    Those that came during a pause do not count, nor those of dead sensors by reason, from `of_dead_sensors`.
     """
-    judged = received - rejected.get(PAUSED, 0)
+    dead = dead or {}
+    judged = received - rejected.get(PAUSED, 0) - sum(dead.values())
+    counts = {reason: count - dead.get(reason, 0) for reason, count in rejected.items()}
     return [
         f'{count} of {judged} {what} were rejected as {reason}: {REASONS[reason]}'
-        for reason, count in rejected.items()
+        for reason, count in counts.items()
         if count > MANY_REJECTED * judged and reason not in known and reason != PAUSED
     ]
+
+
+def of_dead_sensors(by_frame: Mapping[str, Mapping[str, int]], accepted: Mapping[str, tuple[int, int]]) -> Counter[str]:
+    """Return the rejected readings of dead sensors, by reason.
+
+    Nearly all readings of a dead sensor are values that drivers send for 'no echo'. If no other sensor works, that is a
+    fault of the driver. The parameters are those of `sensor_rejections`.
+    """
+    dead: Counter[str] = Counter()
+    frames = set()
+    for frame, counts in by_frame.items():
+        judged = _without_paused(counts)
+        received = sum(judged.values()) + accepted.get(frame, (0, 0))[0]
+        reason = max(judged, key=lambda each: judged[each], default='')
+        if reason in NO_ECHO_REASONS and judged[reason] >= max(NEARLY_ALL * received, LEAST_READINGS):
+            dead[reason] += judged[reason]
+            frames.add(frame)
+    works = {frame for frame, (count, _) in accepted.items() if count} - frames
+    return dead if len(works) >= len(frames) else Counter()
 
 
 def swapped_frames(frame_id: str, child_frame_id: str) -> list[str]:
@@ -243,8 +269,8 @@ def sensor_rejections(
     """Return a warning for each reason, other than known ones, for which nearly all readings of a sensor are rejected.
 
     There is one as well if those without an echo are rejected, of all sensors: the map lacks their free space. There is
-    none for reasons that the user chose, for those that are frequent among all readings (`rejection_warnings`), and if
-    no sensor works. Readings that came during a pause do not count.
+    none for reasons that the user chose, for those that are frequent among the readings of other sensors
+    (`rejection_warnings`), and if no sensor works. Readings that came during a pause do not count.
 
     Parameters
     ----------
@@ -255,12 +281,13 @@ def sensor_rejections(
     """
     by_frame = {frame: judged for frame, counts in by_frame.items() if (judged := _without_paused(counts))}
     rejected: Counter[str] = sum(map(Counter, by_frame.values()), Counter())
-    many = MANY_REJECTED * (rejected.total() + sum(count for count, _ in accepted.values()))
+    dead = of_dead_sensors(by_frame, accepted)
+    many = MANY_REJECTED * (rejected.total() + sum(count for count, _ in accepted.values()) - dead.total())
     lost: dict[str, list[str]] = {}
     for frame, counts in by_frame.items():
         received = sum(counts.values()) + accepted.get(frame, (0, 0))[0]
         reason = max(counts, key=lambda each: counts[each])
-        reported = not frame or reason in CHOSEN_BY_USER or reason in known or rejected[reason] > many
+        reported = not frame or reason in CHOSEN_BY_USER or reason in known or rejected[reason] - dead[reason] > many
         if counts[reason] >= max(NEARLY_ALL * received, LEAST_READINGS) and not reported:
             lost.setdefault(reason, []).append(frame)
     if not set(accepted).difference(*lost.values()):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 import re
 from collections.abc import Callable
@@ -153,6 +154,23 @@ def own_no_echo_value(value: float) -> Messages:
     return drive().with_ranges(lambda m: m._replace(range=min(m.range, value)))
 
 
+def own_no_echo_value_of(frames: tuple[str, ...], value: float) -> Messages:
+    """The same, if only the drivers of some sensors do so, and the others send +inf."""
+
+    def changed(m: RangeMessage) -> RangeMessage:
+        if m.frame_id in frames:
+            return m._replace(range=min(m.range, value))
+        return m._replace(range=math.inf if m.range >= value else m.range)
+
+    return circling().with_ranges(changed)
+
+
+def with_random_echoes(given: Messages, beyond: float) -> Messages:
+    """Half a percent of the readings, and some more, are random echoes from beyond."""
+    count = itertools.count()
+    return given.with_ranges(lambda m: m._replace(range=beyond) if next(count) % 140 == 0 else m)
+
+
 def stamped(change: Callable[[int], int]) -> Messages:
     """Wrong stamps of a driver, for both ranges and odometry."""
     ranges = [m._replace(stamp=change(m.stamp)) for m in circling().ranges]
@@ -207,6 +225,14 @@ SCENARIOS: dict[str, tuple[Callable[[], Messages], str]] = {
     'no echo is 3 m, max_range 5 m': (
         lambda: own_no_echo_value(3.0),
         r'of the echoes are at 3\.000 m.*if there is no echo.*set the parameter max_range to 2\.9,',
+    ),
+    'no echo is 4.2 m in some drivers': (
+        lambda: own_no_echo_value_of(('sonar_1', 'sonar_3'), 4.2),
+        r'of the echoes are at 4\.200 m, hardly any is longer, and no reading of sonar_1, sonar_3 is without an echo',
+    ),
+    'no echo is 3 m, with random echoes': (
+        lambda: with_random_echoes(own_no_echo_value(3.0), 4.0),
+        r'of the echoes are at 3\.000 m.*no reading is without an echo',
     ),
     'no echo is a float below max_range': (lambda: own_no_echo_value(4.9999995), r'of the echoes are at 5\.000 m'),
     'no echo is min_range': (

@@ -16,6 +16,7 @@ from forward_grid_mapper.core.messages.rep117 import (
     REASONS_OUTSIDE_MESSAGE,
     Measurement,
     measure,
+    of_dead_sensors,
     rejection_warnings,
     sensor_rejections,
 )
@@ -50,7 +51,7 @@ def test_warning_names_a_sensor_with_nearly_all_readings_rejected() -> None:
     assert sensor_rejections(by_frame, fine, known={'too_near'}) == []
     # no warning for a frame without name, which has its own reason, nor for a reason that rejected many of all readings
     assert sensor_rejections({'': {'empty_frame_id': 50}}, fine) == []
-    assert sensor_rejections({'left': {'too_near': 600}}, fine) == []
+    assert sensor_rejections({'left': {'bad_limits': 600}}, fine) == []
     # no warning for a sensor without echoes, if these are discarded on purpose
     assert sensor_rejections({'left': {'over_range': 95}}, fine) == []
     # a fault of all sensors has other warnings
@@ -59,6 +60,25 @@ def test_warning_names_a_sensor_with_nearly_all_readings_rejected() -> None:
     without_stamps = {'zero_stamp': 900}
     assert sensor_rejections({'left': {'too_near': 95}, 'right': without_stamps}, {'left': (2, 0)}) == []
     assert len(sensor_rejections({'left': {'too_near': 95}, 'right': without_stamps}, {'rear': (2, 0)})) == 1
+
+
+def test_dead_sensor_is_named_also_if_it_is_one_of_few() -> None:
+    """Its readings are a quarter of all, but not what the driver sends for 'no echo'."""
+    fine = {f'sonar_{k}': (100, 20) for k in range(3)}
+    by_frame = {'left': {'too_near': 98}, 'sonar_1': {'too_near': 2}}
+    accepted = {**fine, 'left': (2, 0)}
+    dead = of_dead_sensors(by_frame, accepted)
+    assert dead == {'too_near': 98}
+    assert rejection_warnings({'too_near': 100}, 402, dead=dead) == []
+    (warning,) = sensor_rejections(by_frame, accepted)
+    assert warning.startswith('nearly all readings of left were rejected as too_near: is the sensor dead')
+    # a fault that others have as well is named for all of them, and most sensors are not dead
+    with_others = {**by_frame, **{frame: {'too_near': 70} for frame in fine}}
+    (common,) = rejection_warnings({'too_near': 308}, 610, dead=of_dead_sensors(with_others, accepted))
+    assert common.startswith('210 of 512 readings were rejected as too_near')
+    assert of_dead_sensors({frame: {'nan_range': 99} for frame in ('a', 'b')}, {'c': (100, 0)}) == {}
+    # no value for 'no echo'
+    assert of_dead_sensors({'left': {'bad_limits': 98}}, accepted) == {}
 
 
 def test_a_pause_is_no_fault_and_hides_none() -> None:

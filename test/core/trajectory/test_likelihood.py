@@ -186,7 +186,9 @@ def test_bare_wall_gives_no_information_along_it() -> None:
     hit = np.full((60, 60), 0.01, np.float32)
     hit[40] = 0.66
     none = np.zeros_like(hit)
-    around = LocalMap(-30.0, -30.0, 0.1, hit.shape, cells_of(hit, none, none, np.zeros((2, hit.size), np.float32)), 0.0, NOTHING)
+    around = LocalMap(
+        -30.0, -30.0, 0.1, hit.shape, cells_of(hit, none, none, np.zeros((2, hit.size), np.float32)), 0.0, NOTHING
+    )
     readings = Readings.from_columns(
         x=np.linspace(-0.2, 0.2, 9), y=0.0, yaw=math.pi / 2, z=np.full(9, 1.02), z_max=4.0, half_angle=0.13
     )
