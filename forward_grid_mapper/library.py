@@ -217,15 +217,15 @@ def make_maps(
             f'{stamps.min() / 1e9:.3f} … {stamps.max() / 1e9:.3f} s'
         )
     maps = live.on(Mapper(chosen).run(associator.readings, watch))
-    by_frame, counts = associator.rejected_by_frame, associator.buffer.counts()
+    by_frame, accepted = associator.rejected_by_frame, associator.buffer.counts()
     before = [
         *_of_the_node(chosen),
         *arrays.ambiguous_stamps(odometry),
         *alternation_note(associator),
         *refused,
         *associator.message_warnings(),
-        *rejection_warnings(associator.rejected, len(values), 'ranges', dead=of_dead_sensors(by_frame, counts)),
-        *sensor_rejections(by_frame, counts),
+        *rejection_warnings(associator.rejected, len(values), 'ranges', dead=of_dead_sensors(by_frame, accepted)),
+        *sensor_rejections(by_frame, accepted),
         *thinning_note(associator),
     ]
     judged = tuple(data_warnings(maps, {'extrinsics': mounted}))

@@ -81,19 +81,22 @@ def _high_sentinel(readings: Readings) -> str:
     if len(heard) < LEAST_ECHOES:
         return ''
     values, counts = np.unique(heard.round(3), return_counts=True)
-    longest = float(values[counts.argmax()])
+    often = values[counts >= SENTINEL_SHARE * len(heard)]
+    if not len(often):
+        return ''
+    longest = float(often[-1])
     same = np.abs(heard - longest) < VALUE_TOLERANCE
     nearly = (heard > longest - GAP_BELOW) & (heard < longest) & ~same
     count, almost = int(np.count_nonzero(same)), int(np.count_nonzero(nearly))
     longer = int(np.count_nonzero(heard >= longest + VALUE_TOLERANCE))
     if longer > max(BEYOND_SHARE * len(heard), OF_SENTINEL * count):
         return ''
-    if count < SENTINEL_SHARE * len(heard) or count < 2 * almost or not _all_around(towards[same]):
+    if count < 2 * almost or not _all_around(towards[same]):
         return ''
     return (
         f'{count / len(heard):.0%} of the echoes are at {longest:.3f} m, hardly any is longer, and '
-        f'{_which(readings, longest)} is without an echo: does the driver send this range if there is no echo? Then set '
-        f'the parameter max_range to {0.98 * longest:.2g}, otherwise a wall is mapped at that range'
+        f'{_which(readings, longest)} is without an echo: does the driver send this range if there is no echo? Then '
+        f'set the parameter max_range to {0.98 * longest:.2g}, otherwise a wall is mapped at that range'
     )
 
 
