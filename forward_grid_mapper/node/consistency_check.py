@@ -33,10 +33,12 @@ class ConsistencyCheck:
         self._worker, self._inbox = worker, inbox
         self._latest: MapSet | None = None
         self._last: _Checked | None = None
+        self._forgotten = 0
 
     def forget(self) -> None:
         """Forget the maps and what was found."""
         self._latest = self._last = None
+        self._forgotten += 1
 
     def warnings(
         self, maps: MapSet, mounts: Mapping[str, Pose2], refined: bool, later: Callable[[list[str]], object]
@@ -54,7 +56,7 @@ class ConsistencyCheck:
         later : callable
             Called by the executor with the warnings of a new check, unless there are later maps by then.
         """
-        self._latest, last = maps, self._last
+        self._latest, last, forgotten = maps, self._last, self._forgotten
         same = last is not None and last[1:4] == (mounts, maps.parameters, refined)
         if last is not None and same and len(maps.readings) < CHECKED_AGAIN * last.readings:
             return last.found
@@ -70,8 +72,11 @@ class ConsistencyCheck:
             self._inbox.put(lambda: take(found))
 
         def take(found: list[str]) -> None:
+            if forgotten != self._forgotten:
+                return
+            # also if there are later maps: otherwise runs that follow each other fast would never be checked
+            self._last = _Checked(len(maps.readings), mounts, maps.parameters, refined, found)
             if maps is self._latest:
-                self._last = _Checked(len(maps.readings), mounts, maps.parameters, refined, found)
                 later(found)
 
         self._worker.put(check)

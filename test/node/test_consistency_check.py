@@ -89,3 +89,18 @@ def test_result_for_earlier_maps_is_not_used(checked: Checked) -> None:
     checked.work()
     assert len(checked.later) == 1
     assert checked.warnings(maps_of(30)) == [], 'what was found before is forgotten'
+
+
+def test_runs_that_are_faster_than_their_checks_get_warnings(checked: Checked) -> None:
+    assert checked.warnings(maps_of(10)) == []
+    running = checked.tasks.pop()
+
+    # the check of the first run ends after the second run
+    def during() -> None:
+        running()
+
+    found: list[list[str]] = []
+    checked.tasks.append(during)
+    assert checked.warnings(maps_of(11)) == found[:0]
+    checked.work()
+    assert checked.warnings(maps_of(12)) == [f'11 {MOUNTS}']

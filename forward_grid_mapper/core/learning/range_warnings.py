@@ -50,6 +50,9 @@ MOST_NO_ECHO = 0.01
 VALUE_TOLERANCE = 0.0005
 """Metres within which two ranges are the same value of the driver."""
 
+FEWEST_WITH_SENTINEL, MOST_AT_SENTINEL = 2, 0.7
+"""Fewest sensors with a sentinel if other sensors have none, and the largest part of their readings that are at it."""
+
 GAP_BELOW, LEAST_DIRECTIONS = 0.05, 3
 """Within this many metres below a sentinel there are few echoes, unlike for a wall; and it is sent in at least this
 many twelfths of the circle."""
@@ -63,7 +66,7 @@ LARGEST_SIGMA = 0.5
 
 def range_warnings(readings: Readings) -> list[str]:
     """Return warnings about the values of readings in the order of their stamps; empty if there is no suspicion."""
-    checks = (_high_sentinel, _low_sentinel, _field_of_view, _range_limit, _variance)
+    checks = (_high_sentinel, _sentinel_of_some, _low_sentinel, _field_of_view, _range_limit, _variance)
     return [text for check in checks if (text := check(readings))]
 
 
@@ -77,27 +80,56 @@ def sensors(readings: Readings) -> Iterable[tuple[str, Readings]]:
 
 def _high_sentinel(readings: Readings) -> str:
     """Check for a sentinel below max_range: the longest range, which occurs again and again."""
-    heard, towards = _of_sensors_that_always_hear(readings)
-    if len(heard) < LEAST_ECHOES:
+    heard, towards = _echoes_if_no_reading_lacks_one(readings)
+    longest, share = _longest_of_many(heard, towards)
+    if not share:
         return ''
+    return (
+        f'{share:.0%} of the echoes are at {longest:.3f} m, hardly any is longer, and no reading is '
+        'without an echo: does the driver send this range if there is no echo? Then set the parameter max_range to '
+        f'{0.98 * longest:.2g}, otherwise a wall is mapped at that range'
+    )
+
+
+def _sentinel_of_some(readings: Readings) -> str:
+    """Check for a sentinel of some sensors, whose driver is another one."""
+    always = {name: mine for name, mine in sensors(readings) if _always_hears(mine)}
+    if _always_hears(readings) or not always:
+        return ''
+    moved = {name: mine.select(moving(mine)) for name, mine in always.items()}
+    heard, towards = (np.concatenate([getattr(mine, of) for mine in moved.values()]) for of in ('z', 'yaw'))
+    longest, _ = _longest_of_many(heard, towards)
+    parts = {name: np.mean(np.abs(mine.z - longest) < VALUE_TOLERANCE) for name, mine in moved.items() if len(mine)}
+    # what a sensor hears nearly all the time may be the robot, or the wall along which it drives
+    names = [name for name, part in parts.items() if SENTINEL_SHARE <= part <= MOST_AT_SENTINEL]
+    # if the others hear nothing from farther away, it may be a wall
+    farther = np.mean(readings.z[readings.echo] > longest + VALUE_TOLERANCE)
+    if len(names) < FEWEST_WITH_SENTINEL or farther < BEYOND_SHARE:
+        return ''
+    return (
+        f'{", ".join(names[:8])}{f" and {len(names) - 8} more" * (len(names) > 8)}: the longest range is '
+        f'{longest:.3f} m again and again, and no reading is without an echo, unlike those of other sensors: does the '
+        'driver send this range if there is no echo? Let it send +inf (REP 117), otherwise a wall is mapped at that range'
+    )
+
+
+def _longest_of_many(heard: Floats, towards: Floats) -> tuple[float, float]:
+    """Return the longest range that occurs often, without others near it, and its fraction; zeros without one."""
+    if len(heard) < LEAST_ECHOES:
+        return 0.0, 0.0
     values, counts = np.unique(heard.round(3), return_counts=True)
     often = values[counts >= SENTINEL_SHARE * len(heard)]
     if not len(often):
-        return ''
+        return 0.0, 0.0
     longest = float(often[-1])
     same = np.abs(heard - longest) < VALUE_TOLERANCE
     nearly = (heard > longest - GAP_BELOW) & (heard < longest) & ~same
     count, almost = int(np.count_nonzero(same)), int(np.count_nonzero(nearly))
     longer = int(np.count_nonzero(heard >= longest + VALUE_TOLERANCE))
-    if longer > max(BEYOND_SHARE * len(heard), OF_SENTINEL * count):
-        return ''
-    if count < 2 * almost or not _all_around(towards[same]):
-        return ''
-    return (
-        f'{count / len(heard):.0%} of the echoes are at {longest:.3f} m, hardly any is longer, and '
-        f'{_which(readings, longest)} is without an echo: does the driver send this range if there is no echo? Then '
-        f'set the parameter max_range to {0.98 * longest:.2g}, otherwise a wall is mapped at that range'
-    )
+    few = longer <= max(BEYOND_SHARE * len(heard), OF_SENTINEL * count)
+    if not few or count < 2 * almost or not _all_around(towards[same]):
+        return 0.0, 0.0
+    return longest, count / len(heard)
 
 
 def _low_sentinel(readings: Readings) -> str:
@@ -121,31 +153,6 @@ def _low_sentinel(readings: Readings) -> str:
         f'without an echo: does the driver send this range if there is no echo? Let it send +inf (REP 117), otherwise '
         f'the robot is mapped as walled in'
     )
-
-
-def _of_sensors_that_always_hear(readings: Readings) -> tuple[Floats, Floats]:
-    """Return ranges and directions, radians, of the echoes of such sensors while the robot moves.
-
-    Sensors with a constant range are left out: they hear a part of the robot.
-    """
-    # during a standstill ranges are constant
-    each = (mine.select(moving(mine)) for _, mine in sensors(readings) if _always_hears(mine))
-    parts = [mine.select(mine.echo) for mine in each if len(mine) and np.ptp(mine.z) > GAP_BELOW]
-    if not parts:
-        return np.zeros(0), np.zeros(0)
-    return np.concatenate([mine.z for mine in parts]), np.concatenate([mine.yaw for mine in parts])
-
-
-def _which(readings: Readings, value: float) -> str:
-    """Return the readings of which none is without an echo, in words: all, or those of sensors that send a value."""
-    if _always_hears(readings):
-        return 'no reading'
-    names = [
-        name
-        for name, mine in sensors(readings)
-        if _always_hears(mine) and np.mean(np.abs(mine.z - value) < VALUE_TOLERANCE) >= SENTINEL_SHARE
-    ]
-    return f'no reading of {", ".join(names[:8])}{f" and {len(names) - 8} more" * (len(names) > 8)}'
 
 
 def _always_hears(mine: Readings) -> bool:

@@ -222,22 +222,21 @@ def rejection_warnings(
 
 
 def of_dead_sensors(by_frame: Mapping[str, Mapping[str, int]], accepted: Mapping[str, tuple[int, int]]) -> Counter[str]:
-    """Return the rejected readings of dead sensors, by reason.
+    """Return the rejected readings of dead sensors, by reason; the parameters are those of `sensor_rejections`.
 
-    Nearly all readings of a dead sensor are values that drivers send for 'no echo'. If no other sensor works, that is a
-    fault of the driver. The parameters are those of `sensor_rejections`.
+    Nearly all readings of a dead sensor are values that drivers send for 'no echo', and the other sensors hardly send
+    them. Otherwise they stand for 'no echo', and the sensor only has nothing within range.
     """
+    counts = {frame: _without_paused(by_frame.get(frame, {})) for frame in {*by_frame, *accepted}}
+    received = {frame: sum(each.values()) + accepted.get(frame, (0, 0))[0] for frame, each in counts.items()}
     dead: Counter[str] = Counter()
-    frames = set()
-    for frame, counts in by_frame.items():
-        judged = _without_paused(counts)
-        received = sum(judged.values()) + accepted.get(frame, (0, 0))[0]
-        reason = max(judged, key=lambda each: judged[each], default='')
-        if reason in NO_ECHO_REASONS and judged[reason] >= max(NEARLY_ALL * received, LEAST_READINGS):
-            dead[reason] += judged[reason]
-            frames.add(frame)
-    works = {frame for frame, (count, _) in accepted.items() if count} - frames
-    return dead if len(works) >= len(frames) else Counter()
+    for reason in NO_ECHO_REASONS:
+        of_reason = {frame: each.get(reason, 0) for frame, each in counts.items() if received[frame]}
+        lost = {frame for frame, n in of_reason.items() if n >= max(NEARLY_ALL * received[frame], LEAST_READINGS)}
+        others = of_reason.keys() - lost
+        if len(others) >= len(lost) and all(of_reason[each] < NO_ECHO_REJECTED * received[each] for each in others):
+            dead[reason] = sum(of_reason[frame] for frame in lost)
+    return +dead
 
 
 def swapped_frames(frame_id: str, child_frame_id: str) -> list[str]:

@@ -49,6 +49,13 @@ WORTH_FITTING = 1.0
 fitted before they are compared."""
 
 
+NEARLY_ALL = 0.95
+"""If so many of the blocks on an earlier visit are recognised, no other start is tried."""
+
+AGREED = 0.15
+"""Two starts agree if their trajectories differ by less than this, metres (rms after alignment, also of the size)."""
+
+
 class MatchedDrive(NamedTuple):
     """The trajectory of a drive from matching alone.
 
@@ -63,6 +70,8 @@ class MatchedDrive(NamedTuple):
         Fraction of the blocks on an earlier visit that are recognised.
     scans : Scans
         With the windows that were held out.
+    agreed : bool
+        Whether another start led to the same trajectory.
     """
 
     nodes: Floats
@@ -70,6 +79,7 @@ class MatchedDrive(NamedTuple):
     value: float
     part: float
     scans: Scans
+    agreed: bool = False
 
 
 def match_drive(
@@ -82,9 +92,9 @@ def match_drive(
 ) -> MatchedDrive | None:
     """Return the trajectory of a drive from matching alone; None if its J is not larger than that of odometry.
 
-    If the trajectory from walls is `known`, J must be larger than that of it as well. If few places are recognised, the
-    search got lost somewhere. Small changes then lead to other places, so it is repeated with other windows held out,
-    and J decides.
+    If the trajectory from walls is `known`, J must be larger than that of it as well. A search that got lost somewhere
+    ends elsewhere after small changes. So unless nearly all places are recognised, it is repeated from other starts and
+    with other windows held out, until two agree. J decides between them.
 
     Parameters
     ----------
@@ -114,38 +124,53 @@ def match_drive(
         # more trust in readings does not help if nothing had a larger J than odometry
         if make is starts[-1] and best is None:
             break
-        found = _match_repeatedly(odometry, scans, start_stage, make(), remaining, value)
+        found, reached = _match_repeatedly(odometry, scans, start_stage, make(), remaining, value)
+        agreed = best is not None and _agree(best.nodes, reached)
         if found is not None:
             best, value = found, found.value
-        # if most places are recognised another trial hardly helps
-        if best is not None and best.part >= LEAST_RECOGNISED:
-            break
+        if best is not None and (agreed or best.part >= NEARLY_ALL):
+            return best._replace(agreed=agreed)
     for begin in OTHERS:
-        if best is None or best.part >= LEAST_RECOGNISED or known is not None:
+        if best is None or known is not None:
             break
         other = scans.with_held_out(held_out(len(scans.windows), begin))
         nodes, least = scan_matched_with(TRUSTS[0], other), other.objective(other.windows.node)
-        found = _match_repeatedly(odometry, other, start_stage, nodes, remaining, least)
+        found, reached = _match_repeatedly(odometry, other, start_stage, nodes, remaining, least)
+        agreed = _agree(best.nodes, reached)
         if found is not None and _objective(scans, found.nodes) > value:
             best, value = found, scans.objective(found.nodes)
+        if agreed or best.part >= NEARLY_ALL:
+            return best._replace(agreed=agreed)
     return best
+
+
+def _agree(nodes: Floats, others: Floats) -> bool:
+    """Return whether two trajectories agree, apart from their size, which is changed last."""
+    middle = others[:, :2].mean(0)
+    spread = [float(np.square(each[:, :2] - each[:, :2].mean(0)).sum()) for each in (nodes, others)]
+    sized = others.copy()
+    sized[:, :2] = middle + math.sqrt(spread[0] / spread[1]) * (others[:, :2] - middle)
+    return rms_after_alignment(nodes, sized) < AGREED
 
 
 def _match_repeatedly(
     odometry: Odometry, scans: Scans, start_stage: Callable[[str], Progress], start: Floats, noise: float, least: float
-) -> MatchedDrive | None:
-    """Return the best result of repeated matching, once more at another scale; None if J is at most `least`."""
+) -> tuple[MatchedDrive | None, Floats]:
+    """Return the best result of repeated matching, once more at another scale; None if J is at most `least`.
+
+    And the nodes that were reached.
+    """
     change = sensitivity(odometry, scans.windows)
-    found = _rounds(scans, start_stage, start, noise, change, least)
+    found, reached = _rounds(scans, start_stage, start, noise, change, least)
     if found is None:
-        return None
+        return None, reached
     scaled = _scaled(found, start_stage('scale'))
     if scaled is not found:
         # otherwise matches would undo a part of the change
         change[:, :, CALIBRATION.index('scale')] = 0.0
-        found = _rounds(scans, start_stage, scaled.nodes, noise, change, scaled.value, scaled.loops) or scaled
-        found = _scaled(found, start_stage('scale'))
-    return found
+        again, _ = _rounds(scans, start_stage, scaled.nodes, noise, change, scaled.value, scaled.loops)
+        found = _scaled(again or scaled, start_stage('scale'))
+    return found, found.nodes
 
 
 def _rounds(
@@ -156,10 +181,11 @@ def _rounds(
     change: Floats,
     least: float,
     found_before: Sequence[Loop] = (),
-) -> MatchedDrive | None:
+) -> tuple[MatchedDrive | None, Floats]:
     """Return the best of some rounds of matching, each from the result before; None if J is at most `least`.
 
-    With loop closures that were found before, the first search is near the poses that these give.
+    And the nodes of the last round. With loop closures that were found before, the first search is near the poses that
+    these give.
     """
     nodes, best = start, None
     for _ in range(ROUNDS):
@@ -172,7 +198,7 @@ def _rounds(
         best, least = MatchedDrive(nodes, loops, value, recognised_part(scans, nodes, loops), scans), value
         if best.part >= LEAST_RECOGNISED or rms_after_alignment(before, nodes) < SETTLED:
             break
-    return best
+    return best, nodes
 
 
 def _objective(scans: Scans, nodes: Floats) -> float:

@@ -20,6 +20,7 @@ from ..common.readings import Floats, Readings
 from ..evidence.evidence import Evidence
 from ..evidence.learned_normals import NO_INCIDENCE_LIMIT
 from ..maps.traversed import traversed_cells
+from ..runtime.cancelling import check
 from ..runtime.memory import memory_for_pairs
 from ..search.search import Search, SearchResult
 from ..sensor.cone_table import grid_of
@@ -162,6 +163,7 @@ def soft_map(evidence: Evidence, grid: Grid, traversed: NDArray[np.bool_], model
     x, y = (normals.x, normals.y) if len(normals.known) else np.zeros((2, hit.size), np.float32)
     cones = evidence.state.cones[: len(evidence)]
     bearing = mean_bearings(cones, grid.shape, ml.ravel() == 1, evidence.state.stop)
+    check(evidence.state.stop)
     return LocalMap(
         float(grid.column),
         float(grid.row),

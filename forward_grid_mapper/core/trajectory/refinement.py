@@ -175,7 +175,7 @@ class Refiner:
         return Refinement(
             True,
             f'walls are not assumed to be at right angles; {at_revisits}{gain_words(better)}'
-            f'{_recognition_words(found.part)}',
+            f'{_recognition_words(found)}',
             replaced(readings, odometry, trajectory),
             trajectory,
             by_name,
@@ -288,11 +288,14 @@ def _unsupported(drive: Drive, by_walls: Attempt, better: Gain) -> Refinement:
     return Refinement(False, reason + NOR_MATCHES, drive.readings, drive.odometry, found.calibration, gain=found.gain)
 
 
-def _recognition_words(part: float) -> str:
-    """Return the warning about the fraction of blocks on earlier visits that are recognised; empty if it is large."""
-    if part >= LEAST_RECOGNISED:
+def _recognition_words(found: MatchedDrive) -> str:
+    """Return the warning about the fraction of blocks on earlier visits that are recognised; empty if it is large.
+
+    If two starts agree, the search is not lost, but places look alike.
+    """
+    if found.part >= LEAST_RECOGNISED or found.agreed:
         return ''
-    return f'; {part:.0%} of the path through places seen before is recognised: the drive may be bent as a whole'
+    return f'; {found.part:.0%} of the path through places seen before is recognised: the drive may be bent as a whole'
 
 
 def _report_part(watch: Watch, name: str, stage: str, part: float) -> None:

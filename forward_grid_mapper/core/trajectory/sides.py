@@ -18,8 +18,8 @@ from ..sensor.cone import rows_of, runs_of
 from ..sensor.cone_table import Cones, cone_of
 
 ONE_SIDE = 0.5
-"""A surface was seen from one side only if the mean resultant length of the bearings of its echoes is larger. From both
-sides, bearings cancel."""
+"""A surface was seen from one side if the mean resultant length of the bearings of its echoes is larger. Bearings from
+both sides cancel: it is not larger if a quarter of the echoes or more come from the other side."""
 
 BEHIND = math.cos(math.radians(120.0))
 """Where the normal is unknown, rays come from behind such a surface if the cosine of their angle to the mean bearing is
@@ -64,7 +64,7 @@ def mean_bearings(
 ) -> NDArray[np.float32]:
     """Return the mean bearing of the echoes of each occupied cell as a unit vector, float32, shape (2, cells).
 
-    It is 0 where a surface was seen from both sides, and in the other cells.
+    It is 0 where a surface was seen from both sides (`ONE_SIDE`), and in the other cells.
 
     Parameters
     ----------

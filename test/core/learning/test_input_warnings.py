@@ -160,7 +160,7 @@ def own_no_echo_value_of(frames: tuple[str, ...], value: float) -> Messages:
     def changed(m: RangeMessage) -> RangeMessage:
         if m.frame_id in frames:
             return m._replace(range=min(m.range, value))
-        return m._replace(range=math.inf if m.range >= value else m.range)
+        return m._replace(range=math.inf if m.range >= m.max_range - 0.3 else m.range)
 
     return circling().with_ranges(changed)
 
@@ -226,9 +226,9 @@ SCENARIOS: dict[str, tuple[Callable[[], Messages], str]] = {
         lambda: own_no_echo_value(3.0),
         r'of the echoes are at 3\.000 m.*if there is no echo.*set the parameter max_range to 2\.9,',
     ),
-    'no echo is 4.2 m in some drivers': (
-        lambda: own_no_echo_value_of(('sonar_1', 'sonar_3'), 4.2),
-        r'of the echoes are at 4\.200 m, hardly any is longer, and no reading of sonar_1, sonar_3 is without an echo',
+    'no echo is 4.4 m in some drivers': (
+        lambda: own_no_echo_value_of(('sonar_1', 'sonar_3'), 4.4),
+        r'^sonar_1, sonar_3: the longest range is 4\.400 m again and again.*unlike those of other sensors.*send \+inf',
     ),
     'no echo is 3 m, with random echoes': (
         lambda: with_random_echoes(own_no_echo_value(3.0), 4.0),

@@ -20,7 +20,7 @@ from forward_grid_mapper.core.trajectory.matching import Match
 from forward_grid_mapper.core.trajectory.odometry_model import CALIBRATION
 from forward_grid_mapper.core.trajectory.passes import Matches, Progress
 from forward_grid_mapper.core.trajectory.pose_graph import Solution, solution_at
-from forward_grid_mapper.core.trajectory.poses import relative
+from forward_grid_mapper.core.trajectory.poses import compose, relative
 from forward_grid_mapper.core.trajectory.scan_matching import TRUSTS, Trust
 from forward_grid_mapper.core.trajectory.scans import Scans
 from forward_grid_mapper.simulation.drift import odometry_of
@@ -33,16 +33,22 @@ class Trials:
     ----------
     values : list of float, float
         The part of the blocks that are recognised in each round, and its J.
-    far : float
-        Metres by which a round moves the nodes.
+    far : float or list of float
+        Metres by which each round moves the nodes.
     others : tuple of int
         Further folds that are tried.
     """
 
     def __init__(
-        self, monkeypatch, values: list[tuple[float, float]], far: float = 1.0, others: tuple[int, ...] = ()
+        self,
+        monkeypatch,
+        values: list[tuple[float, float]],
+        far: float | list[float] = 1.0,
+        others: tuple[int, ...] = (),
     ) -> None:
         monkeypatch.setattr(any_angle, 'OTHERS', others)
+        # otherwise all starts would agree
+        monkeypatch.setattr(any_angle, 'AGREED', 0.0)
         self.calls: list[tuple[Floats, float]] = []
         self._far = far
         self.loops: list[Loop] = []
@@ -61,7 +67,8 @@ class Trials:
         self.found_before.append(found_before)
         nodes = solution.nodes.copy()
         np.testing.assert_array_equal(self.calls[-1][0], relative(nodes[:-1], nodes[1:]))
-        nodes[len(nodes) // 2 :, 0] += self._far
+        far = self._far
+        nodes[len(nodes) // 2 :, 0] += far[len(self.calls) - 1] if isinstance(far, list) else far
         return solution_at(nodes, 4), self.loops
 
 
@@ -83,12 +90,12 @@ def test_map_of_the_whole_drive_is_made_once_for_the_same_nodes(scans, monkeypat
 @pytest.mark.parametrize(
     ('values', 'rounds'),
     [
-        ([(0.9, 1.0)], 1),
-        ([(0.5, 1.0), (0.9, 2.0)], 2),
+        ([(0.96, 1.0)], 1),
+        ([(0.5, 1.0), (0.96, 2.0)], 2),
         # if J does not grow in a round, another trust is tried
-        ([(0.5, 1.0), (0.5, 0.5), (0.9, 3.0)], 1),
-        ([(0.5, 1.0), (0.5, 2.0), (0.9, 1.5), (0.9, 1.0)], 2),
-        ([(0.5, 1.0), (0.5, 1.0), (0.9, 0.5)], 1),
+        ([(0.5, 1.0), (0.5, 0.5), (0.96, 3.0)], 1),
+        ([(0.5, 1.0), (0.5, 2.0), (0.96, 1.5), (0.96, 1.0)], 2),
+        ([(0.5, 1.0), (0.5, 1.0), (0.96, 0.5)], 1),
         ([(0.5, 1.0 + k) for k in range(2 * any_angle.ROUNDS)], any_angle.ROUNDS),
     ],
 )
@@ -104,7 +111,7 @@ def test_rounds_continue_while_few_places_are_recognised_and_j_grows(
 
 
 def test_round_whose_map_would_be_too_large_is_the_last(bent, scans, monkeypatch) -> None:
-    trials, objective = Trials(monkeypatch, [(0.5, 1.0), (0.9, 2.0), (0.9, 0.5)]), Scans.objective
+    trials, objective = Trials(monkeypatch, [(0.5, 1.0), (0.96, 2.0), (0.96, 0.5)]), Scans.objective
 
     def limited(s: Scans, nodes: Floats) -> float:
         if len(trials.calls) == 2:
@@ -152,13 +159,13 @@ def test_rounds_end_early_below_the_j_of_a_known_trajectory(bent, scans, monkeyp
     ('values', 'begins', 'value'),
     [
         # nothing more is tried if most places are recognised
-        ([(0.9, 1.0)], [0.0], 1.0),
-        ([(0.5, 1.0), (0.5, 0.5), (0.9, 3.0)], [0.0, 1.0, 5.0], 3.0),
-        ([(0.5, 1.0), (0.5, 0.5), (0.5, 0.5), (0.9, 3.0)], [0.0, 1.0, 5.0, 0.0], 3.0),
-        ([(0.5, 2.0), (0.5, 0.5), (0.5, 1.0), (0.9, 1.5)], [0.0, 1.0, 5.0, 0.0], 2.0),
+        ([(0.96, 1.0)], [0.0], 1.0),
+        ([(0.5, 1.0), (0.5, 0.5), (0.96, 3.0)], [0.0, 1.0, 5.0], 3.0),
+        ([(0.5, 1.0), (0.5, 0.5), (0.5, 0.5), (0.96, 3.0)], [0.0, 1.0, 5.0, 0.0], 3.0),
+        ([(0.5, 2.0), (0.5, 0.5), (0.5, 1.0), (0.96, 1.5)], [0.0, 1.0, 5.0, 0.0], 2.0),
         # also if J of the first is no larger than that of odometry
-        ([(0.9, -1.0), (0.9, 1.0)], [0.0, 5.0], 1.0),
-        ([(0.9, -1.0), (0.9, -1.0)], [0.0, 5.0], None),
+        ([(0.96, -1.0), (0.96, 1.0)], [0.0, 5.0], 1.0),
+        ([(0.96, -1.0), (0.96, -1.0)], [0.0, 5.0], None),
     ],
 )
 def test_given_nodes_are_another_start(
@@ -182,11 +189,11 @@ def test_given_nodes_are_another_start(
     ('values', 'folds', 'value', 'fold'),
     [
         # the last of the first fold, then one or two others
-        ([(0.5, 2.0), (0.5, 1.0), (0.9, 1.0), (0.9, 3.0)], 1, 3.0, 0),
-        ([(0.5, 2.0), (0.5, 1.0), (0.9, 1.0), (0.9, 1.5), (0.9, 3.0)], 2, 3.0, 2),
-        ([(0.5, 2.0), (0.5, 1.0), (0.9, 1.0), (0.9, 1.5), (0.9, 1.9)], 2, 2.0, None),
-        ([(0.9, 2.0)], 0, 2.0, None),
-        ([(0.9, -1.0)], 0, None, None),
+        ([(0.5, 2.0), (0.5, 1.0), (0.96, 1.0), (0.96, 3.0)], 1, 3.0, 0),
+        ([(0.5, 2.0), (0.5, 1.0), (0.96, 1.0), (0.96, 1.5), (0.96, 3.0)], 2, 3.0, 2),
+        ([(0.5, 2.0), (0.5, 1.0), (0.96, 1.0), (0.96, 1.5), (0.96, 1.9)], 2, 2.0, None),
+        ([(0.96, 2.0)], 0, 2.0, None),
+        ([(0.96, -1.0)], 0, None, None),
     ],
 )
 def test_search_that_got_lost_is_repeated_with_other_windows_held_out(
@@ -210,6 +217,35 @@ def test_search_that_got_lost_is_repeated_with_other_windows_held_out(
         np.testing.assert_array_equal(
             found.scans.held_out, held_out(len(scans.windows), *([] if fold is None else [fold]))
         )
+
+
+@pytest.mark.parametrize(
+    ('values', 'moves', 'value'),
+    [
+        # the second start leads to the same trajectory, with a smaller J, and with a larger one
+        ([(0.5, 2.0), (0.5, 1.0), (0.5, 1.5)], [1.0, 0.0, 1.1], 2.0),
+        ([(0.9, 2.0), (0.9, 3.0)], [1.0, 1.1], 3.0),
+        # only that of the second other fold does
+        ([(0.9, 2.0), (0.9, 1.5), (0.9, 1.0), (0.9, 1.0)], [1.0, 9.0, 5.0, 1.1], 2.0),
+        ([(0.9, 2.0), (0.9, 1.5), (0.9, 3.0), (0.9, 1.0)], [1.0, 9.0, 5.0, 5.1], 3.0),
+    ],
+)
+def test_search_ends_if_two_starts_agree(
+    bent, scans, monkeypatch, values: list[tuple[float, float]], moves: list[float], value: float
+) -> None:
+    trials = Trials(monkeypatch, values, moves, others=(0, 2, 4))
+    monkeypatch.setattr(any_angle, 'AGREED', 0.15)
+    found = any_angle.match_drive(bent[1], scans, lambda stage: quietly)
+    assert found is not None
+    assert (found.agreed, found.value, len(trials.calls)) == (True, value, len(values))
+
+
+def test_trajectories_agree_if_only_their_sizes_differ(scans) -> None:
+    nodes = scans.windows.node
+    assert any_angle._agree(nodes, compose(np.array([9.0, -3.0, 1.0]), nodes * [1.07, 1.07, 1.0]))
+    bent = nodes.copy()
+    bent[len(nodes) // 2 :, 0] += 1.0
+    assert not any_angle._agree(nodes, bent)
 
 
 def scaled_from(scans: Scans, nodes: Floats, loops: Sequence[Loop] = ()) -> MatchedDrive:
@@ -280,7 +316,7 @@ def test_scale_is_the_top_of_the_objective_if_that_is_clear(
     assert Scaled(monkeypatch, best, sigmas).scale() == pytest.approx(scale)
 
 
-@pytest.mark.parametrize(('sigmas', 'scale'), [((0.9, 3.0), 1.0), ((2.2, 2.2), 1.0), ((1.0, 2.3), 1.07)])
+@pytest.mark.parametrize(('sigmas', 'scale'), [((0.96, 3.0), 1.0), ((2.2, 2.2), 1.0), ((1.0, 2.3), 1.07)])
 def test_both_are_fitted_if_the_scale_may_be_wrong(monkeypatch, sigmas: tuple[float, ...], scale: float) -> None:
     drive = Scaled(monkeypatch, 1.07, *sigmas)
     assert drive.scale() == pytest.approx(scale)
@@ -318,7 +354,7 @@ def test_scale_whose_map_would_be_too_large_is_not_taken(exact, scans, monkeypat
 
 
 def test_next_round_holds_the_scale_that_was_found(bent, scans, monkeypatch) -> None:
-    trials = Trials(monkeypatch, [(0.9, 1.0), (0.9, 2.0)], far=0.0)
+    trials = Trials(monkeypatch, [(0.96, 1.0), (0.96, 2.0)], far=0.0)
     larger = scans.windows.node * [1.05, 1.05, 1.0]
 
     def scaled(found: MatchedDrive, watch: Progress) -> MatchedDrive:
@@ -334,7 +370,7 @@ def test_next_round_holds_the_scale_that_was_found(bent, scans, monkeypatch) -> 
 
 
 def test_first_round_at_another_scale_searches_near_the_loop_closures_before(bent, scans, monkeypatch) -> None:
-    trials = Trials(monkeypatch, [(0.9, 1.0), (0.5, 2.0), (0.9, 3.0)])
+    trials = Trials(monkeypatch, [(0.96, 1.0), (0.5, 2.0), (0.96, 3.0)])
     before, now, examined = Loop(40, 3, Matches()), Loop(40, 3, Matches()), list[MatchedDrive]()
     trials.loops = [before]
 
