@@ -108,8 +108,8 @@ def _sentinel_of_some(readings: Readings) -> str:
         return ''
     return (
         f'{", ".join(names[:8])}{f" and {len(names) - 8} more" * (len(names) > 8)}: the longest range is '
-        f'{longest:.3f} m again and again, and no reading is without an echo, unlike those of other sensors: does the '
-        'driver send this range if there is no echo? Let it send +inf (REP 117), otherwise a wall is mapped at that range'
+        f'{longest:.3f} m again and again, and no reading is without an echo, unlike those of other sensors: does its '
+        'driver send this range if there is no echo? Let it send +inf (REP 117), otherwise a wall is mapped there'
     )
 
 
