@@ -91,16 +91,18 @@ def test_result_for_earlier_maps_is_not_used(checked: Checked) -> None:
     assert checked.warnings(maps_of(30)) == [], 'what was found before is forgotten'
 
 
-def test_runs_that_are_faster_than_their_checks_get_warnings(checked: Checked) -> None:
+def test_run_during_a_check_gets_its_warnings_later(checked: Checked, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Otherwise runs that follow each other faster than their checks would never be checked."""
+
+    def with_another_run(readings: Any, mounts: Any, parameters: Any) -> list[str]:
+        if len(readings) == 10:
+            assert checked.warnings(maps_of(11)) == []
+        return [f'{len(readings)} readings']
+
+    monkeypatch.setattr(consistency_check, 'consistency_warnings', with_another_run)
     assert checked.warnings(maps_of(10)) == []
-    running = checked.tasks.pop()
-
-    # the check of the first run ends after the second run
-    def during() -> None:
-        running()
-
-    found: list[list[str]] = []
-    checked.tasks.append(during)
-    assert checked.warnings(maps_of(11)) == found[:0]
-    checked.work()
-    assert checked.warnings(maps_of(12)) == [f'11 {MOUNTS}']
+    checked.tasks.pop(0)()
+    checked.node.turn()
+    # what was found is of earlier maps
+    assert checked.later == []
+    assert checked.warnings(maps_of(12)) == ['10 readings']
