@@ -21,7 +21,15 @@ from .core.messages.extrinsics import Mount
 from .core.messages.message_types import NANOSECONDS, OdometryMessage, Pose2, RangeMessage
 from .core.messages.mounts import FARTHEST_MOUNT, more_than_a_turn
 from .core.messages.pose_association import PoseAssociator
-from .core.messages.rep117 import REASONS, odometry_rejections, of_dead_sensors, rejection_warnings, sensor_rejections
+from .core.messages.rejections import (
+    odometry_rejections,
+    of_dead_sensors,
+    rejection_warnings,
+    sensor_rejections,
+)
+from .core.messages.rep117 import (
+    REASONS,
+)
 from .files.pose_files import poses_from_csv, poses_from_tum
 from .files.quality_warning import data_warnings
 from .files.results import write_results

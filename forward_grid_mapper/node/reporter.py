@@ -10,7 +10,13 @@ from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from ..core.messages.extrinsics import STEEP
 from ..core.messages.mounts import far_mounts
 from ..core.messages.pose_association import PoseAssociator
-from ..core.messages.rep117 import REASONS, REASONS_OUTSIDE_MESSAGE, sensor_rejections
+from ..core.messages.rejections import (
+    sensor_rejections,
+)
+from ..core.messages.rep117 import (
+    REASONS,
+    REASONS_OUTSIDE_MESSAGE,
+)
 from ..core.messages.sensor_records import MOST_FRAMES
 from . import diagnostics
 from .background import Worker

@@ -8,7 +8,9 @@ from diagnostic_msgs.msg import DiagnosticStatus
 
 from ..core.common.words import counted
 from ..core.learning.sensor_health import SensorHealth, health_warning
-from ..core.messages.rep117 import MOST_NO_ECHO
+from ..core.messages.rejections import (
+    MOST_NO_ECHO,
+)
 from .diagnostics import listed, status
 
 LEAST_PAUSES, LEAST_READINGS, READINGS_A_PAUSE = 5, 100, 1000

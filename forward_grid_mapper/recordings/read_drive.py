@@ -22,13 +22,15 @@ from ..core.messages.message_batch import batch_of
 from ..core.messages.message_types import NANOSECONDS, Pose2
 from ..core.messages.mounts import far_mounts
 from ..core.messages.pose_association import PoseAssociator
-from ..core.messages.rep117 import (
-    ODOMETRY_REASONS,
-    REASONS,
+from ..core.messages.rejections import (
     odometry_rejections,
     of_dead_sensors,
     rejection_warnings,
     sensor_rejections,
+)
+from ..core.messages.rep117 import (
+    ODOMETRY_REASONS,
+    REASONS,
 )
 from ..files.journal import drive_file
 from ..files.output_folder import readable

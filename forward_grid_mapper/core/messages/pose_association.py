@@ -26,16 +26,18 @@ from .message_types import NANOSECONDS, OdometryMessage, Pose2, RangeMessage
 from .missing_readings import MissingReadings
 from .pose_history import PoseHistory
 from .reading_buffer import ReadingBuffer
-from .rep117 import (
-    LONGEST_NAME,
+from .rejections import (
     MANY_REJECTED,
-    Measurement,
-    measure,
     odometry_rejections,
     of_dead_sensors,
     rejection_warnings,
     sensor_rejections,
     swapped_frames,
+)
+from .rep117 import (
+    LONGEST_NAME,
+    Measurement,
+    measure,
 )
 from .robot_path import RobotPath
 from .stamp_order import JUMP, JUMPED_BACK, WAS_AHEAD, order_of
