@@ -14,9 +14,7 @@ from numpy.typing import NDArray
 from ..common.readings import Floats
 from .holding_out import FEWEST_BLOCKS, LEAST_SIGMAS, Gain, blocks_of, gain, held_out_blocks, predicted
 from .passes import BLOCK, Progress
-from .poses import wrapped
 from .scans import Scans
-from .windows import Windows
 
 SPAN = 6.0
 """Metres of progress before and after a block within which windows make its map."""
@@ -35,10 +33,6 @@ robot came back. That outweighs it only by this many times as many standard erro
 FIRST, FEWEST_FIRST, CLEAR = 3, 12, 2.0
 """One block of this many is compared first, if these are so many; the others only if the gain of all blocks is not
 expected to be beyond the thresholds by this many σ. A local map for each block takes most of the time."""
-
-TURNED, LEAST_SIGMAS_OF_TURNS = math.radians(8.0), 1.5
-"""A turn within `SPAN` is examined if trajectory and odometry differ by this many radians. Readings there must be
-predicted better by this many standard errors: it is -4 to -6 at corners that are not square, and 2 to 7 with drift."""
 
 
 def gain_over_drive(scans: Scans, before: Floats, after: Floats, watch: Progress) -> Gain:
@@ -139,25 +133,3 @@ def gain_of_objective(scans: Scans, before: Floats, after: Floats) -> Gain:
     if len(blocks) < FEWEST_BLOCKS:
         return Gain(0.0, np.inf)
     return Gain((more - value) / len(blocks), float(blocks.std(ddof=1) / np.sqrt(len(blocks))))
-
-
-def turns_supported(scans: Scans, nodes: Floats) -> bool:
-    """Return whether readings support the turns that the trajectory makes within a few metres and odometry does not.
-
-    True as well if there are too few such turns. A corner that is wrongly taken for a right angle looks like an error
-    of odometry.
-    """
-    windows = scans.windows
-    blocks = blocks_of(len(windows), BLOCK, len(windows))
-    excess = np.array([_excess_turn(windows, nodes, block[len(block) // 2]) for block in blocks])
-    sharp = [blocks[k] for k in np.sort(np.argsort(-excess, kind='stable')[:JUDGED_ON]) if excess[k] > TURNED]
-    if len(sharp) < FEWEST_BLOCKS:
-        return True
-    better = _compared(scans, windows.node, nodes, sharp, (LEAST_SIGMAS_OF_TURNS, LEAST_SIGMAS_OF_TURNS), SPAN)
-    return bool(np.isinf(better.error)) or better.sigmas > LEAST_SIGMAS_OF_TURNS
-
-
-def _excess_turn(windows: Windows, nodes: Floats, middle: int) -> float:
-    """Return the difference between the turns of nodes and of odometry within `SPAN` around a node, radians."""
-    near = np.flatnonzero(np.abs(windows.node_progress - windows.node_progress[middle]) <= SPAN / 2)[[0, -1]]
-    return float(abs(wrapped(np.diff(nodes[near, 2] - windows.node[near, 2])[0])))

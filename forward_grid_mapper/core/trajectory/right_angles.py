@@ -12,6 +12,7 @@ import numpy as np
 from ..common.errors import InputError
 from ..common.readings import Floats
 from .attempt import ACCURACY, EXACT, UNMATCHED, Attempt, Drive, gain_words, refined
+from .corners import turns_supported
 from .folds import accepted_in_folds
 from .heading import NOISES, Heading, heading
 from .holding_out import LEAST_SIGMAS, Gain, has_revisits, tears_apart
@@ -23,7 +24,6 @@ from .judging import (
     gain_within_visits,
     is_worse_nearby,
     last_not_worse,
-    turns_supported,
 )
 from .loops import Loop
 from .odometry_model import CALIBRATION

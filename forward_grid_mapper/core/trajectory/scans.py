@@ -120,6 +120,11 @@ class Scans:
             self._explained[along] = value, np.bincount(window, each, len(self.windows)).astype(np.float64)
         return self._explained[along]
 
+    def objective_of(self, members: NDArray[np.int64], origin: Floats, nodes: Floats) -> float:
+        """Return J of the map of some windows in the frame `origin`, with nodes of shape (K, 3), nats."""
+        which = self._readings_of(members)
+        return explained(self._placed(which, nodes, origin), self._parameters, self._stop, 1)[0]
+
     def _readings_of(self, members: NDArray[np.int64]) -> NDArray[np.int64]:
         first = self.windows.first
         return np.concatenate([np.arange(first[k], first[k + 1]) for k in members if not self.held_out[k]])

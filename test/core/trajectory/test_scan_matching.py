@@ -17,7 +17,7 @@ from forward_grid_mapper.core.trajectory import refinement, right_angles, scan_m
 from forward_grid_mapper.core.trajectory.any_angle import MatchedDrive
 from forward_grid_mapper.core.trajectory.attempt import ACCURACY, Attempt, Drive
 from forward_grid_mapper.core.trajectory.holding_out import Gain, held_out
-from forward_grid_mapper.core.trajectory.judging import gain_of_objective, turns_supported
+from forward_grid_mapper.core.trajectory.judging import gain_of_objective
 from forward_grid_mapper.core.trajectory.likelihood import scores
 from forward_grid_mapper.core.trajectory.local_map import for_matching
 from forward_grid_mapper.core.trajectory.outcome import Refinement
@@ -313,15 +313,6 @@ def test_objective_of_windows_sums_up_to_all_without_the_prior(scans) -> None:
     maps = Mapper(for_matching(Parameters())).run(scans.windows.readings.select(kept))
     assert windows.sum() == pytest.approx(maps.statistics['searched_log_likelihood'], rel=1e-3)
     assert windows.sum() != pytest.approx(value, rel=1e-3)
-
-
-def test_turns_missing_in_odometry_are_distinguished_from_drift(exact, bent, scans) -> None:
-    true = odometry_of(exact).at(scans.windows.node_stamp)
-    odometry = scans.windows.node
-    assert turns_supported(scans, true)
-    assert not turns_supported(scans, as_if_square(odometry, true))
-    # nothing is tested if odometry turns as the nodes do
-    assert turns_supported(scans, odometry)
 
 
 def test_scan_matching_can_be_cancelled(bent, monkeypatch) -> None:
