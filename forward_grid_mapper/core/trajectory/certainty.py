@@ -3,7 +3,11 @@
 Walls measure the yaw all along a trajectory. So the errors of the yaw of odometry follow from a linear regression over
 pieces of the drive, and their standard deviations from its residuals:
 
-    Δyaw of the trajectory − Δyaw of odometry  =  bias · ahead + turn_scale · turn + noise
+    Δyaw of the trajectory − Δyaw of odometry  =  bias · ahead + turn_scale · Δyaw of odometry + noise
+
+The noise is that of the odometry, so it is part of the turn on the right, and least squares would find turns of
+odometry too large (errors in variables). The turn of the trajectory has hardly any of it, and is the instrument: the
+residuals are uncorrelated with `ahead` and with it.
 
 Scale and heading cannot be found by regression: where readings do not tell the distance, as along a bare corridor, the
 trajectory follows the odometry and would agree with it. They are found from the likelihood of readings: f(c) is the
@@ -136,15 +140,16 @@ def yaw_errors(odometry: Odometry, trajectory: Odometry) -> dict[str, Calibratio
     columns = [np.diff(np.interp(ends, knots, column)) for column in (ahead, pose[:, 2])]
     difference = np.diff(np.interp(ends, knots, np.unwrap(wrapped(trajectory.pose[:, 2] - pose[:, 2]))))
     regressors = np.stack(columns, axis=1)
-    gram = regressors.T @ regressors
-    if np.linalg.matrix_rank(gram) < 2:
+    instruments = np.stack([columns[0], columns[1] + difference], axis=1)
+    product = instruments.T @ regressors
+    if np.linalg.matrix_rank(product) < 2:
         return {}
-    inverse = np.linalg.inv(gram)
-    values = inverse @ (regressors.T @ difference)
+    inverse = np.linalg.inv(product)
+    values = inverse @ (instruments.T @ difference)
     residual = difference - regressors @ values
     # standard errors robust to heteroscedasticity, since wheels slip now and then
-    spread = regressors * (residual * math.sqrt(len(residual) / (len(residual) - 2)))[:, None]
-    sigma = np.sqrt(np.diag(inverse @ (spread.T @ spread) @ inverse))
+    spread = instruments * (residual * math.sqrt(len(residual) / (len(residual) - 2)))[:, None]
+    sigma = np.sqrt(np.diag(inverse @ (spread.T @ spread) @ inverse.T))
     return {name: CalibrationEstimate(float(v), float(s)) for name, v, s in zip(YAW_ERRORS, values, sigma, strict=True)}
 
 
