@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from ..common.readings import Floats
 from .likelihood import Scan, scores
 from .local_map import LocalMap
-from .loops import APART, LENGTH, SHARED, Loop, Places, find_loop
+from .loops import APART, GOOD, LENGTH, SHARED, Loop, Places, find_loop
 from .loops import REACH as LOOP_REACH
 from .matching import grid_around
 from .poses import compose, relative
@@ -63,6 +63,10 @@ SIGMA = np.array([0.1, 0.1, math.radians(1.5)])
 LEAST_RECOGNISED = 0.85
 """Fraction of the blocks on an earlier visit that are recognised if the trajectory is not bent."""
 
+LEAST_FITTING, FEWEST_RECOGNISED = 0.95, 0.5
+"""Fraction of the blocks on an earlier visit that are recognised, or fit where they lie, if the trajectory is not bent;
+and of those that are recognised."""
+
 MORE_RECOGNISED = 2
 """This many more blocks must be recognised at another place."""
 
@@ -94,6 +98,37 @@ def recognised_part(scans: Scans, nodes: Floats, loops: Sequence[Loop]) -> float
     """Return the fraction of the blocks on an earlier visit that are recognised; 1 if there are none."""
     blocks = revisits(scans, nodes).tolist()
     return len(recognised(loops).intersection(blocks)) / len(blocks) if blocks else 1.0
+
+
+def fits_earlier_visits(scans: Scans, nodes: Floats, loops: Sequence[Loop]) -> bool:
+    """Return whether blocks on an earlier visit are recognised or fit there, nearly all of them.
+
+    A block is not recognised if it looks alike from several poses, as along a bare corridor. It contradicts the
+    trajectory only if it does not fit where it lies.
+    """
+    blocks, seen = revisits(scans, nodes), recognised(loops)
+    others = [block for block in blocks.tolist() if block not in seen]
+    if len(others) <= (1.0 - LEAST_RECOGNISED) * len(blocks):
+        return True
+    if len(others) > (1.0 - FEWEST_RECOGNISED) * len(blocks):
+        return False
+    usual, places = float(np.median([loop.matches.mean_score for loop in loops])), Places(scans, nodes)
+    misfits = sum(not _fits(scans, nodes, block, places, GOOD * usual) for block in others)
+    return misfits <= (1.0 - LEAST_FITTING) * len(blocks)
+
+
+def _fits(scans: Scans, nodes: Floats, number: int, places: Places, least: float) -> bool:
+    """Return whether a block fits on its nearest earlier visit, by at least so many nats a reading."""
+    progress, block = scans.windows.node_progress, windows_of(np.array([number]), len(nodes))
+    middle = int(block[len(block) // 2])
+    before = np.arange(0, len(nodes), SHARED)
+    before = before[progress[before] < progress[middle] - APART]
+    place = int(before[np.hypot(*(nodes[before, :2] - nodes[middle, :2]).T).argmin()])
+    around, joint = places[place], scans.joint(block, relative(nodes[middle], nodes[block]))
+    if around is None or not len(joint.readings):
+        return False
+    value = float(scores(joint, around, relative(nodes[place], nodes[middle])[None])[0])
+    return value >= least * len(joint.readings)
 
 
 def confirmed_by_places(scans: Scans, nodes: Floats, loops: Sequence[Loop]) -> bool:

@@ -31,7 +31,7 @@ from .outcome import Differences, Refinement, differences, replaced
 from .passes import Progress
 from .pose_graph import Solution
 from .poses import rms_after_alignment
-from .relocating import LEAST_RECOGNISED, confirmed_by_places, recognised, recognised_part
+from .relocating import confirmed_by_places, fits_earlier_visits, recognised
 from .repeated_errors import BENT, are_walls_bent
 from .scans import Scans
 from .solving import SETTLED, Solver
@@ -379,7 +379,7 @@ def _accepted(drive: Drive, best: _Candidate, verdict: _Verdict, noise: float, l
         verdict.gain.mean,
         noise=noise,
     )
-    sure = recognised_part(scans, best.nodes, best.loops) >= LEAST_RECOGNISED and turns_supported(scans, best.nodes)
+    sure = fits_earlier_visits(scans, best.nodes, best.loops) and turns_supported(scans, best.nodes)
     sure = sure and not (verdict.by_votes and _is_contradicted(drive, best.nodes))
     return Attempt(outcome, best.nodes, sure, verdict.by_votes, matched=best.matched)
 

@@ -419,7 +419,7 @@ def test_votes_do_not_suffice_if_readings_as_a_whole_contradict_them(
     let_come_back(monkeypatch, lambda *rest: False)
     monkeypatch.setattr(right_angles, 'gain_over_drive', lambda *rest: Gain(0.001, 0.01))
     monkeypatch.setattr(right_angles, 'gain_at_revisits', lambda *rest: Gain(0.001, 0.01))
-    monkeypatch.setattr(right_angles, 'recognised_part', lambda *rest: 1.0)
+    monkeypatch.setattr(right_angles, 'fits_earlier_visits', lambda *rest: True)
     monkeypatch.setattr(right_angles, 'turns_supported', lambda *rest: True)
     monkeypatch.setattr(right_angles, 'accepted_in_folds', lambda *rest: None)
     for module in (right_angles, refinement):

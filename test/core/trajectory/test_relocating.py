@@ -11,7 +11,7 @@ import pytest
 from exact_tour import Tour, quietly, tour_with
 
 from forward_grid_mapper.core.common.readings import Floats
-from forward_grid_mapper.core.trajectory import hypotheses, solving
+from forward_grid_mapper.core.trajectory import hypotheses, relocating, solving
 from forward_grid_mapper.core.trajectory.doubts import DOUBTFUL, doubts, slight
 from forward_grid_mapper.core.trajectory.heading import Heading
 from forward_grid_mapper.core.trajectory.holding_out import LEAST_SIGMAS, Gain
@@ -30,6 +30,7 @@ from forward_grid_mapper.core.trajectory.relocating import (
     confirmed,
     confirmed_by_places,
     displaced,
+    fits_earlier_visits,
     recognised,
     revisits,
     unsupported,
@@ -101,6 +102,33 @@ def test_trajectory_of_a_drive_without_revisits_needs_no_places() -> None:
     tour = tour_with(sonar_ring(16), building_tour()[:4])
     assert not len(revisits(tour.scans, tour.windows.node))
     assert confirmed_by_places(tour.scans, tour.windows.node, [])
+    assert fits_earlier_visits(tour.scans, tour.windows.node, [])
+
+
+def scored(loops: list[Loop], nats: float) -> list[Loop]:
+    """Return the loops with this mean score of a reading."""
+    for loop in loops:
+        loop.matches.score, loop.matches.readings = 10.0 * nats, 10
+    return loops
+
+
+def test_blocks_that_are_not_recognised_may_fit_where_they_lie(there_and_back, monkeypatch) -> None:
+    scans, true = there_and_back.scans, there_and_back.windows.node
+    blocks = revisits(scans, true).tolist()
+    some = scored(found_at(there_and_back, blocks[: math.ceil(0.6 * len(blocks))], 0), 0.8)
+    assert not confirmed_by_places(scans, true, some)
+    assert fits_earlier_visits(scans, true, some)
+    # they do not fit as well as this, nor half a metre beside
+    assert not fits_earlier_visits(scans, true, scored(some, 3.0))
+    beside = true + (np.arange(len(true)) >= turning(there_and_back))[:, None] * (0.3, 0.5, 0.0)
+    assert not fits_earlier_visits(scans, beside, scored(some, 0.8))
+    few = scored(found_at(there_and_back, blocks[: int(0.4 * len(blocks))], 0), 0.8)
+    assert not fits_earlier_visits(scans, true, few)
+    assert not fits_earlier_visits(scans, true, [])
+    # if nearly all are recognised, the others are not examined
+    monkeypatch.setattr(relocating, '_fits', None)
+    most = scored(found_at(there_and_back, blocks[: math.ceil(LEAST_RECOGNISED * len(blocks))], 0), 3.0)
+    assert fits_earlier_visits(scans, true, most)
 
 
 def test_torn_trajectory_is_better_on_maps_of_all_visits_only(there_and_back) -> None:
