@@ -32,8 +32,8 @@ angle looks like an error of odometry."""
 MOST_TURNS = 60
 """Most turns that are examined."""
 
-CHANGES, FINER = tuple(math.radians(degrees) for degrees in (-20.0, -10.0, 10.0, 20.0)), math.radians(5.0)
-"""Changes of a turn that are tried, and the step around the best one, radians."""
+CHANGES = tuple(math.radians(degrees) for degrees in (-20.0, -10.0, 10.0, 20.0))
+"""Changes of a turn that are tried, radians."""
 
 LEAST_GAIN = 10.0
 """A turn is wrong if another one gives a J that is larger by this many nats."""
@@ -41,19 +41,11 @@ LEAST_GAIN = 10.0
 
 def turns_supported(scans: Scans, nodes: Floats) -> bool:
     """Return whether readings support the turns of a trajectory that odometry does not have, nodes of shape (K, 3)."""
-    doubtful = turns_of(scans.windows, nodes, LEAST_EXCESS)[:MOST_TURNS]
-    return all(gain_of_other_turn(scans, nodes, middle) < LEAST_GAIN for middle in doubtful)
+    return all(gain_of_other_turn(scans, nodes, middle) < LEAST_GAIN for middle in turns_of(scans.windows, nodes))
 
 
-def with_likeliest_turns(scans: Scans, nodes: Floats) -> Floats:
-    """Return the nodes with each turn changed to the one of the largest J."""
-    for middle in turns_of(scans.windows, nodes):
-        nodes = with_turn(scans.windows, nodes, middle, _likeliest_change(scans, nodes, middle))
-    return nodes
-
-
-def turns_of(windows: Windows, nodes: Floats, least_excess: float = 0.0) -> list[int]:
-    """Return the middle nodes of turns, those that differ most from odometry first, and by more than this, radians."""
+def turns_of(windows: Windows, nodes: Floats, least_excess: float = LEAST_EXCESS) -> list[int]:
+    """Return the middle nodes of the turns to examine, those that differ most from odometry first."""
     progress = windows.node_progress
     begin = np.searchsorted(progress, progress - WITHIN)
     end = np.searchsorted(progress, progress + WITHIN, side='right') - 1
@@ -67,7 +59,7 @@ def turns_of(windows: Windows, nodes: Floats, least_excess: float = 0.0) -> list
             left &= np.abs(progress - progress[middle]) > 2 * WITHIN
             out.append(middle)
     out.sort(key=lambda node: -float(excess[node]))
-    return [node for node in out if excess[node] >= least_excess]
+    return [node for node in out if excess[node] >= least_excess][:MOST_TURNS]
 
 
 def gain_of_other_turn(scans: Scans, nodes: Floats, middle: int) -> float:
@@ -82,19 +74,6 @@ def gain_of_other_turn(scans: Scans, nodes: Floats, middle: int) -> float:
         if gains.max() < 0.0:
             break
     return float(gains.max())
-
-
-def _likeliest_change(scans: Scans, nodes: Floats, middle: int) -> float:
-    """Return the change of a turn that gives the largest J of the map around, radians; 0 if it is hardly larger."""
-    tried = np.array([0.0, *CHANGES])
-    values = _objectives(scans, nodes, middle, tried, nodes[middle])
-    best = float(tried[int(np.argmax(values))])
-    near = best + np.array([-FINER, 0.0, FINER])
-    before, here, after = _objectives(scans, nodes, middle, near, nodes[middle])
-    curvature = 2.0 * here - before - after
-    if curvature <= 0.0:
-        return best
-    return best + float(np.clip(0.5 * (after - before) / curvature, -1.0, 1.0)) * FINER
 
 
 def _objectives(scans: Scans, nodes: Floats, middle: int, changes: Sequence[float], frame: Floats) -> list[float]:

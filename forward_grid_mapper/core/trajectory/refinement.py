@@ -27,7 +27,6 @@ from .after_jumps import Part, begins_of, parts_at, with_doubtful
 from .any_angle import MatchedDrive, match_drive
 from .attempt import ACCURACY, EXACT, Attempt, Drive, gain_words, refined
 from .certainty import LARGEST_SIGMA, yaw_errors
-from .corners import with_likeliest_turns
 from .fitting import gain_when_fitted
 from .holding_out import LEAST_SIGMAS, Gain, has_revisits, held_out, tears_apart
 from .judging import gain_at_revisits, gain_of_objective, gain_within_visits, is_worse_nearby
@@ -142,8 +141,7 @@ class Refiner:
             return _without_better(by_walls.refinement, too_sparse_words(apart))
         try:
             noise = self._parameters.association.odometry_noise
-            start = by_walls.start if known is None else with_likeliest_turns(scans, known)
-            found = match_drive(odometry, scans, self._start_stage, noise, known, start)
+            found = match_drive(odometry, scans, self._start_stage, noise, known, by_walls.start)
         except InputError:
             # at the cell size of matching, the map of the whole drive may be too large although the final maps are not
             found = None

@@ -10,13 +10,11 @@ import pytest
 from forward_grid_mapper.core.common.readings import Floats
 from forward_grid_mapper.core.trajectory import corners
 from forward_grid_mapper.core.trajectory.corners import (
-    LEAST_EXCESS,
     LEAST_GAIN,
     WITHIN,
     gain_of_other_turn,
     turns_of,
     turns_supported,
-    with_likeliest_turns,
     with_turn,
 )
 from forward_grid_mapper.core.trajectory.poses import relative, wrapped
@@ -33,7 +31,7 @@ def true(exact: Recording, scans: Scans) -> Floats:
 @pytest.fixture(scope='module')
 def places(scans: Scans, true: Floats) -> list[int]:
     """The middle nodes of the seven corners."""
-    return turns_of(scans.windows, true)
+    return turns_of(scans.windows, true, 0.0)
 
 
 def turned_at(scans: Scans, nodes: Floats, places: list[int], change: float) -> Floats:
@@ -44,7 +42,7 @@ def turned_at(scans: Scans, nodes: Floats, places: list[int], change: float) -> 
 
 def test_turns_missing_in_odometry_are_distinguished_from_drift(scans, true, places) -> None:
     assert len(places) == 7
-    assert turns_of(scans.windows, true, LEAST_EXCESS), 'odometry drifts at some corners'
+    assert turns_of(scans.windows, true), 'odometry drifts at some corners'
     assert turns_supported(scans, true)
     # as if the corners of 72° were square
     square = turned_at(scans, true, places, math.radians(18.0))
@@ -75,10 +73,10 @@ def test_a_turn_is_changed_by_the_angle_and_nowhere_else(scans, true, places) ->
 
 
 def test_only_corners_that_odometry_does_not_have_are_examined(scans, true, places) -> None:
-    assert turns_of(scans.windows, scans.windows.node, LEAST_EXCESS) == []
+    assert turns_of(scans.windows, scans.windows.node) == []
     assert np.diff(scans.windows.node_progress[np.sort(places)]).min() > 2 * WITHIN
     changed = with_turn(scans.windows, true, places[2], math.radians(20.0))
-    assert places[2] in turns_of(scans.windows, changed, LEAST_EXCESS)
+    assert places[2] in turns_of(scans.windows, changed)
     # a robot that turns around passes the same walls again, and a gentle bend is no corner
     for degrees in (100.0, -60.0):
         assert places[2] not in turns_of(
@@ -96,26 +94,6 @@ def test_turns_that_differ_most_from_odometry_come_first(scans, true, places, mo
     assert not turns_supported(scans, changed)
     monkeypatch.setattr(corners, 'MOST_TURNS', 0)
     assert turns_supported(scans, changed)
-
-
-def test_turns_are_changed_to_the_likeliest_ones(scans, true, places) -> None:
-    changes = np.radians([18.0, -12.0, 0.0, 9.0, -20.0, 14.0, -16.0])
-    bent = true
-    for middle, change in zip(places, changes, strict=True):
-        bent = with_turn(scans.windows, bent, middle, float(change))
-    before, after = (off_at(scans, nodes, true, places) for nodes in (bent, with_likeliest_turns(scans, bent)))
-    np.testing.assert_allclose(before, changes, atol=1e-9)
-    assert np.abs(after).max() < math.radians(6.0)
-    assert np.sqrt((after**2).mean()) < math.radians(3.0)
-
-
-def off_at(scans: Scans, nodes: Floats, true: Floats, places: list[int]) -> Floats:
-    """Return by how much turns of nodes are larger than the true ones, radians."""
-    progress = scans.windows.node_progress
-    off = np.unwrap(nodes[:, 2]) - np.unwrap(true[:, 2])
-    before, after = (np.searchsorted(progress, progress[places] + side * (WITHIN + 0.4)) for side in (-1, 1))
-    out: Floats = wrapped(off[np.minimum(after, len(off) - 1)] - off[before])
-    return out
 
 
 def test_a_turn_without_readings_is_not_doubted(scans, true, places) -> None:
