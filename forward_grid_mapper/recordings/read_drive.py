@@ -123,7 +123,7 @@ def read_drive(
         warnings += _warnings(bag, associator, lookup)
     if not len(associator.buffer):
         if not associator.received and spans.left_out:
-            first, last = spans.left_out
+            first, *_, last = sorted([*spans.left_out, *spans.odometry])
             raise InputError(
                 f'{path} has no reading in the part {part}; its messages span {(last - first) / NANOSECONDS:.1f} s'
             )

@@ -286,6 +286,9 @@ def test_odometry_without_child_frame_is_rejected(tmp_path: Path, capsys: pytest
 def test_stamps_of_zero_are_rejected_with_a_remedy(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     error = error_of_drive(capsys, tmp_path, tape().with_ranges(stamp=0))
     assert f'{COUNT} zero_stamp (header.stamp is 0: set it in the driver)' in error
+    # also if a part is mapped
+    error = error_of_drive(capsys, tmp_path / 'part', tape().with_ranges(stamp=0), '--duration', 1)
+    assert f'{COUNT} zero_stamp (header.stamp is 0: set it in the driver)' in error
 
 
 def test_only_readings_of_a_sensor_without_pose_are_rejected(tmp_path: Path) -> None:

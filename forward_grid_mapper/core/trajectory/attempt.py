@@ -25,6 +25,8 @@ SMALLEST_GAIN = 0.0005
 
 UNMATCHED = '; it comes from walls alone, without loop closures: with these, readings are predicted worse'
 
+CONTRADICTED = '; but the readings at corners contradict right angles, so the drive may be bent there'
+
 
 class Drive(NamedTuple):
     """A drive, its windows and their scans."""
@@ -59,6 +61,8 @@ class Attempt(NamedTuple):
         Nodes of a trajectory that was refused after matching, from which other methods may start.
     matched : bool
         Whether matches and loop closures were used; otherwise readings were predicted worse with them.
+    turns_contradicted : bool
+        Whether readings contradict the turns at corners (`corners`).
     """
 
     refinement: Refinement
@@ -69,6 +73,7 @@ class Attempt(NamedTuple):
     unproven: Attempt | None = None
     start: Floats | None = None
     matched: bool = True
+    turns_contradicted: bool = False
 
 
 def refined(odometry: Odometry, windows: Windows, nodes: Floats) -> Odometry:

@@ -32,8 +32,8 @@ angle looks like an error of odometry."""
 MOST_TURNS = 60
 """Most turns that are examined."""
 
-CHANGES = tuple(math.radians(degrees) for degrees in (-20.0, -10.0, 10.0, 20.0))
-"""Changes of a turn that are tried, radians."""
+CHANGES, FINER = tuple(math.radians(degrees) for degrees in (-30.0, -20.0, -10.0, 10.0, 20.0, 30.0)), math.radians(5.0)
+"""Changes of a turn that are tried, and the step around the best one, radians."""
 
 LEAST_GAIN = 10.0
 """A turn is wrong if another one gives a J that is larger by this many nats."""
@@ -42,6 +42,13 @@ LEAST_GAIN = 10.0
 def turns_supported(scans: Scans, nodes: Floats) -> bool:
     """Return whether readings support the turns of a trajectory that odometry does not have, nodes of shape (K, 3)."""
     return all(gain_of_other_turn(scans, nodes, middle) < LEAST_GAIN for middle in turns_of(scans.windows, nodes))
+
+
+def with_likeliest_turns(scans: Scans, nodes: Floats) -> Floats:
+    """Return the nodes with each turn changed to the one of the largest J."""
+    for middle in turns_of(scans.windows, nodes, 0.0):
+        nodes = with_turn(scans.windows, nodes, middle, _likeliest_change(scans, nodes, middle))
+    return nodes
 
 
 def turns_of(windows: Windows, nodes: Floats, least_excess: float = LEAST_EXCESS) -> list[int]:
@@ -74,6 +81,17 @@ def gain_of_other_turn(scans: Scans, nodes: Floats, middle: int) -> float:
         if gains.max() < 0.0:
             break
     return float(gains.max())
+
+
+def _likeliest_change(scans: Scans, nodes: Floats, middle: int) -> float:
+    """Return the change of a turn that gives the largest J of the map around, radians."""
+    tried = (0.0, *CHANGES)
+    best = tried[int(np.argmax(_objectives(scans, nodes, middle, tried, nodes[middle])))]
+    before, here, after = _objectives(scans, nodes, middle, (best - FINER, best, best + FINER), nodes[middle])
+    curvature = 2.0 * here - before - after
+    if curvature <= 0.0:
+        return best
+    return best + FINER * float(np.clip(0.5 * (after - before) / curvature, -1.0, 1.0))
 
 
 def _objectives(scans: Scans, nodes: Floats, middle: int, changes: Sequence[float], frame: Floats) -> list[float]:

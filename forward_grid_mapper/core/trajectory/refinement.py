@@ -37,7 +37,7 @@ from .outcome import Differences, Refinement, differences, joined_parts, replace
 from .passes import BLOCK
 from .refinable import unfit, without_times
 from .relocating import LEAST_RECOGNISED, confirmed_by_places
-from .right_angles import at_right_angles, proven_in_folds
+from .right_angles import at_right_angles, proven_in_folds, start_from
 from .scans import Scans
 from .standing import without_stands
 from .windows import TRAVEL, Odometry, cut
@@ -141,7 +141,8 @@ class Refiner:
             return _without_better(by_walls.refinement, too_sparse_words(apart))
         try:
             noise = self._parameters.association.odometry_noise
-            found = match_drive(odometry, scans, self._start_stage, noise, known, by_walls.start)
+            start = start_from(scans, by_walls) if by_walls.turns_contradicted else by_walls.start
+            found = match_drive(odometry, scans, self._start_stage, noise, known, start)
         except InputError:
             # at the cell size of matching, the map of the whole drive may be too large although the final maps are not
             found = None
@@ -198,7 +199,7 @@ class Refiner:
             by_walls = at_right_angles(drive, noise, least, self._start_stage, odometry_is_wrong=True)
         if by_walls is None or not by_walls.refinement.accepted:
             return None
-        if tears_apart(drive.scans, nodes, by_walls.nodes):
+        if by_walls.turns_contradicted or tears_apart(drive.scans, nodes, by_walls.nodes):
             return None
         # neither must have been fitted to the windows that are predicted
         by_held_out = (gain_at_revisits,) if matched.scans is drive.scans else ()

@@ -11,8 +11,8 @@ import numpy as np
 
 from ..common.errors import InputError
 from ..common.readings import Floats
-from .attempt import ACCURACY, EXACT, UNMATCHED, Attempt, Drive, gain_words, refined
-from .corners import turns_supported
+from .attempt import ACCURACY, CONTRADICTED, EXACT, UNMATCHED, Attempt, Drive, gain_words, refined
+from .corners import turns_supported, with_likeliest_turns
 from .folds import accepted_in_folds
 from .heading import NOISES, Heading, heading
 from .holding_out import LEAST_SIGMAS, Gain, has_revisits, tears_apart
@@ -163,7 +163,7 @@ def at_right_angles(
     # matching takes most of the time, and is left out if nothing supports its result
     if not (walls.proven or walls.votes_suffice or odometry_is_wrong):
         if walls.heading.certainty < LEAST_CERTAINTY:
-            return _heading_lost(drive, walls.heading.certainty)
+            return _heading_lost(drive, walls.heading.certainty)._replace(start=walls.along.nodes)
         if walls.vote_gain <= LEAST_VOTE_GAIN and not _may_be_proven_at_revisits(drive, walls, start_stage):
             return _unproven(drive, walls, walls.verdict)._replace(before_matching=True)
     found = solve_hypotheses(drive.scans, walls.heading, walls.solver, walls.along, solver_of)
@@ -184,8 +184,13 @@ def at_right_angles(
         return _unproven(drive, walls, verdict)
     if (proven := proven_in_folds(drive, attempt, odometry_noise, start_stage)) is not None:
         return proven
-    start = None if tears_apart(drive.scans, drive.windows.node, attempt.nodes) else attempt.nodes
+    start = None if tears_apart(drive.scans, drive.windows.node, attempt.nodes) else start_from(drive.scans, attempt)
     return _unproven(drive, walls, verdict)._replace(unproven=attempt, start=start)
+
+
+def start_from(scans: Scans, attempt: Attempt) -> Floats:
+    """Return the nodes of an attempt, from which matching alone may start, with the likeliest turns if need be."""
+    return with_likeliest_turns(scans, attempt.nodes) if attempt.turns_contradicted else attempt.nodes
 
 
 def proven_in_folds(
@@ -295,7 +300,10 @@ def _kept(
 
 def _heading_lost(drive: Drive, certainty: float) -> Attempt:
     """Return odometry, since the heading is only this certain."""
-    reason = f'the heading was lost: the probability that it is not wrong by a right angle is only {certainty:.0%}'
+    reason = (
+        f'the heading was lost: it may be wrong by a right angle (probability {1.0 - certainty:.0%}); if you know the '
+        'random error of the yaw of odometry, set odometry_noise'
+    )
     refused = Refinement(False, reason, drive.readings, drive.odometry, {}, lost=True)
     return Attempt(refused, drive.windows.node)
 
@@ -368,9 +376,11 @@ def _accepted(drive: Drive, best: _Candidate, verdict: _Verdict, noise: float, l
         return _kept(drive, reason, best.calibration, verdict.gain.mean, sure=True)
     if are_walls_bent(windows, best.nodes):
         return _kept(drive, BENT, gain=verdict.gain.mean)._replace(start=best.nodes)
+    contradicted = not turns_supported(scans, best.nodes)
+    words = verdict.words if best.matched else verdict.words + UNMATCHED
     outcome = Refinement(
         True,
-        verdict.words if best.matched else verdict.words + UNMATCHED,
+        words + CONTRADICTED if contradicted else words,
         replaced(readings, odometry, trajectory),
         trajectory,
         best.calibration,
@@ -379,9 +389,9 @@ def _accepted(drive: Drive, best: _Candidate, verdict: _Verdict, noise: float, l
         verdict.gain.mean,
         noise=noise,
     )
-    sure = fits_earlier_visits(scans, best.nodes, best.loops) and turns_supported(scans, best.nodes)
+    sure = not contradicted and fits_earlier_visits(scans, best.nodes, best.loops)
     sure = sure and not (verdict.by_votes and _is_contradicted(drive, best.nodes))
-    return Attempt(outcome, best.nodes, sure, verdict.by_votes, matched=best.matched)
+    return Attempt(outcome, best.nodes, sure, verdict.by_votes, matched=best.matched, turns_contradicted=contradicted)
 
 
 def _is_contradicted(drive: Drive, nodes: Floats) -> bool:

@@ -15,6 +15,7 @@ from forward_grid_mapper.core.trajectory.corners import (
     gain_of_other_turn,
     turns_of,
     turns_supported,
+    with_likeliest_turns,
     with_turn,
 )
 from forward_grid_mapper.core.trajectory.poses import relative, wrapped
@@ -94,6 +95,25 @@ def test_turns_that_differ_most_from_odometry_come_first(scans, true, places, mo
     assert not turns_supported(scans, changed)
     monkeypatch.setattr(corners, 'MOST_TURNS', 0)
     assert turns_supported(scans, changed)
+
+
+def test_turns_are_changed_to_the_likeliest_ones(scans, true, places) -> None:
+    changes = np.radians([18.0, -12.0, 0.0, 9.0, -20.0, 14.0, -16.0])
+    bent = true
+    for middle, change in zip(places, changes, strict=True):
+        bent = with_turn(scans.windows, bent, middle, float(change))
+    before, after = (off_at(scans, nodes, true, places) for nodes in (bent, with_likeliest_turns(scans, bent)))
+    np.testing.assert_allclose(before, changes, atol=1e-9)
+    assert np.sqrt((after**2).mean()) < math.radians(3.0)
+
+
+def off_at(scans: Scans, nodes: Floats, true: Floats, places: list[int]) -> Floats:
+    """Return by how much turns of nodes are larger than the true ones, radians."""
+    progress = scans.windows.node_progress
+    off = np.unwrap(nodes[:, 2]) - np.unwrap(true[:, 2])
+    before, after = (np.searchsorted(progress, progress[places] + side * (WITHIN + 0.4)) for side in (-1, 1))
+    out: Floats = wrapped(off[np.minimum(after, len(off) - 1)] - off[before])
+    return out
 
 
 def test_a_turn_without_readings_is_not_doubted(scans, true, places) -> None:

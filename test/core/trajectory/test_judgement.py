@@ -15,7 +15,7 @@ from forward_grid_mapper.core.common.parameters import Parameters
 from forward_grid_mapper.core.common.readings import Floats, Readings
 from forward_grid_mapper.core.trajectory import holding_out, refinement, right_angles
 from forward_grid_mapper.core.trajectory.any_angle import MatchedDrive
-from forward_grid_mapper.core.trajectory.attempt import UNMATCHED, Attempt, Drive, gain_words
+from forward_grid_mapper.core.trajectory.attempt import CONTRADICTED, UNMATCHED, Attempt, Drive, gain_words
 from forward_grid_mapper.core.trajectory.heading import Drifts, Heading
 from forward_grid_mapper.core.trajectory.holding_out import EVERY, Gain, gain, held_out
 from forward_grid_mapper.core.trajectory.hypotheses import Solved
@@ -446,6 +446,66 @@ def test_matching_may_start_from_a_refused_trajectory_that_comes_back(
         monkeypatch.setattr(right_angles, 'solve_hypotheses', lambda *rest: replace(solve(*rest), certainty=0.5))
     assert not Refiner(Parameters()).run(*bent).accepted
     assert len(starts) == 1 and (starts[0] is not None) == given
+
+
+def test_matching_may_start_from_straight_walls_if_the_heading_was_lost(bent, monkeypatch) -> None:
+    starts: list[Floats | None] = []
+    monkeypatch.setattr(refinement, 'match_drive', lambda *rest: starts.append(rest[5]))
+    monkeypatch.setattr(right_angles, 'gain_over_drive', lambda *rest: Gain(0.0, 0.01))
+    monkeypatch.setattr(right_angles, 'LEAST_VOTE_GAIN', np.inf)
+    monkeypatch.setattr(right_angles, 'LEAST_CERTAINTY', 1.1)
+    found = Refiner(Parameters()).run(*bent)
+    assert not found.accepted and found.lost
+    assert 'it may be wrong by a right angle' in found.reason and 'set odometry_noise' in found.reason
+    (start,) = starts
+    assert start is not None
+
+
+@pytest.mark.parametrize('accepted', [False, True])
+def test_turns_that_readings_contradict_are_said_and_changed_before_matching(
+    bent, monkeypatch, matched_once, accepted: bool
+) -> None:
+    starts, changed = list[Floats | None](), list[Floats]()
+    monkeypatch.setattr(refinement, 'match_drive', lambda *rest: starts.append(rest[5]))
+    monkeypatch.setattr(right_angles, 'with_likeliest_turns', lambda scans, nodes: changed.append(nodes) or nodes + 1.0)
+    monkeypatch.setattr(right_angles, 'turns_supported', lambda *rest: False)
+    monkeypatch.setattr(right_angles, 'accepted_in_folds', lambda *rest: None)
+    if not accepted:
+        let_come_back(monkeypatch, lambda *rest: True)
+        for name in ('gain_over_drive', 'gain_at_revisits', 'gain_within_visits'):
+            monkeypatch.setattr(right_angles, name, lambda *rest: Gain(0.0, 0.01))
+        monkeypatch.setattr(right_angles, '_is_recognised', lambda *rest: False)
+    found = Refiner(Parameters()).run(*bent)
+    assert found.accepted == accepted
+    assert found.reason.endswith(CONTRADICTED) == accepted
+    np.testing.assert_array_equal(starts[0], changed[0] + 1.0)
+
+
+def test_walls_whose_turns_are_contradicted_are_not_taken_after_all(bent, monkeypatch) -> None:
+    readings, odometry = bent
+    contradicted = False
+
+    def at_right_angles(drive: Drive, *rest) -> Attempt:
+        outcome = Refinement(True, 'walls', readings, odometry, {})
+        walls = Attempt(outcome, drive.windows.node * (1.2, 1.0, 1.0), turns_contradicted=contradicted)
+        return Attempt(replace(outcome, accepted=False), drive.windows.node, unproven=walls)
+
+    def matched(odometry: Odometry, scans: Scans, *rest) -> MatchedDrive:
+        return MatchedDrive(scans.windows.node * (1.1, 1.0, 1.0), [], 0.0, 1.0, scans)
+
+    monkeypatch.setattr(refinement, 'at_right_angles', at_right_angles)
+    monkeypatch.setattr(refinement, 'match_drive', matched)
+    let_come_back(monkeypatch, lambda *rest: True)
+    monkeypatch.setattr(refinement, 'confirmed_by_places', lambda *rest: True)
+    monkeypatch.setattr(refinement, 'gain_within_visits', lambda *rest: Gain(0.0, 0.1))
+    monkeypatch.setattr(refinement, 'gain_when_fitted', lambda *rest: Gain(0.0, 0.1))
+    for sigmas in (50.0, 0.0):
+        gains = iter([Gain(5.0, 0.1), Gain(sigmas, 1.0)])
+        monkeypatch.setattr(refinement, 'gain_at_revisits', lambda *rest, gains=gains: next(gains))
+        assert Refiner(Parameters()).run(readings, odometry).reason.startswith('walls;') == (sigmas == 0.0)
+    contradicted = True
+    monkeypatch.setattr(refinement, 'gain_at_revisits', lambda *rest: Gain(5.0, 0.1))
+    assert Refiner(Parameters()).run(readings, odometry).reason.startswith('walls are not assumed')
 
 
 @pytest.mark.parametrize('own_fold', [False, True])
