@@ -107,11 +107,13 @@ def match_drive(
     known : float64, shape (K, 3), optional
         Nodes of the trajectory from walls.
     start : float64, shape (K, 3), optional
-        Nodes from which matching starts if it recognises few places from those of scan matching.
+        Nodes of a trajectory from walls, from which matching starts if it recognises few places from those of scan
+        matching.
     """
     best, value = None, scans.objective(scans.windows.node)
     if known is not None:
         value = max(value, scans.objective(known))
+    least = value
     remaining = min(REMAINING_YAW_NOISE, noise or REMAINING_YAW_NOISE)
 
     def scan_matched_with(trust: Trust, scans: Scans = scans) -> Floats:
@@ -124,9 +126,11 @@ def match_drive(
         # more trust in readings does not help if nothing had a larger J than odometry
         if make is starts[-1] and best is None:
             break
-        found, reached = _match_repeatedly(odometry, scans, start_stage, make(), remaining, value)
+        # from walls, J may grow beyond that of the other start in a later round only
+        nodes, beyond = make(), least if start is not None and make is starts[1] else value
+        found, reached = _match_repeatedly(odometry, scans, start_stage, nodes, remaining, beyond)
         agreed = best is not None and _agree(best.nodes, reached)
-        if found is not None:
+        if found is not None and found.value > value:
             best, value = found, found.value
         if best is not None and (agreed or best.part >= NEARLY_ALL):
             return best._replace(agreed=agreed)
