@@ -195,7 +195,7 @@ def outcome_words(found: FoundTrajectory) -> str:
         return ''
     if correction is None:
         return f'odometry is used as the trajectory: {refinement.reason}'
-    said = 'trajectory refined'
+    said = f'trajectory refined ({refinement.reason})'
     if found.kept:
         said = f'trajectory of the previous run kept ({refinement.reason}; result of this run alone: {found.kept})'
     return (

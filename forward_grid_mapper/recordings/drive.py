@@ -66,6 +66,8 @@ class Spans:
     ----------
     ranges, odometry, left_out : list of int
         The first and the last stamp of selected messages, and of the others; empty if there are none.
+    stamped : bool
+        Whether any Range message has a stamp other than 0.
     """
 
     def __init__(self, part: Part, margin: float) -> None:
@@ -74,10 +76,12 @@ class Spans:
         self.ranges: list[int] = []
         self.odometry: list[int] = []
         self.left_out: list[int] = []
+        self.stamped = False
 
     def select(self, batch: MessageBatch) -> MessageBatch:
         """Return the messages of the part."""
         ranges, odometry = batch.ranges.stamp, batch.odometry.stamp
+        self.stamped |= bool(ranges.any())
         if self._part.whole:
             _widen(self.ranges, ranges)
             _widen(self.odometry, odometry)
@@ -86,13 +90,13 @@ class Spans:
             self._bounds = self._part.bounds(first)
         begin, end = self._bounds or self._part.bounds(0)
         # as integers, since floats of this size do not represent all of them
-        # a reading without a stamp is in no part; it is rejected for that, and the reason must be heard
-        now = np.array([begin <= stamp < end or stamp == 0 for stamp in ranges.tolist()], np.bool_)
+        now = np.array([begin <= stamp < end for stamp in ranges.tolist()], np.bool_)
         near = [begin - self._margin <= stamp < end + self._margin for stamp in odometry.tolist()]
         moved = np.array(near, np.bool_)
-        _widen(self.ranges, _stamped(ranges[now]))
+        _widen(self.ranges, ranges[now])
         _widen(self.odometry, odometry[moved])
-        _widen(self.left_out, _stamped(np.concatenate([ranges[~now], odometry[~moved]])))
+        left_out = np.concatenate([ranges[~now], odometry[~moved]])
+        _widen(self.left_out, left_out[left_out != 0] if left_out.any() else left_out)
         return batch.select(now, moved)
 
 
@@ -104,11 +108,6 @@ def _first_stamp(batch: MessageBatch) -> int | None:
         if len(stamped):
             found.append((int(kind.place[stamped[0]]), int(kind.stamp[stamped[0]])))
     return min(found)[1] if found else None
-
-
-def _stamped(stamps: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Return the stamps that are not 0; all if there are no others."""
-    return stamps[stamps != 0] if stamps.any() else stamps
 
 
 def _widen(span: list[int], stamps: NDArray[np.int64]) -> None:

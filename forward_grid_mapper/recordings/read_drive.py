@@ -124,8 +124,9 @@ def read_drive(
     if not len(associator.buffer):
         if not associator.received and spans.left_out:
             first, *_, last = sorted([*spans.left_out, *spans.odometry])
+            why = '' if spans.stamped else f': {REASONS["zero_stamp"].replace("is 0", "of all readings is 0")}'
             raise InputError(
-                f'{path} has no reading in the part {part}; its messages span {(last - first) / NANOSECONDS:.1f} s'
+                f'{path} has no reading in the part {part}{why}; its messages span {(last - first) / NANOSECONDS:.1f} s'
             )
         error = _nothing_associated(associator, lookup, spans, undecodable, poses, moving)
         # the rest of the messages may be in the part that cannot be read

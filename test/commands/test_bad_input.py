@@ -31,7 +31,7 @@ from forward_grid_mapper.commands import process_bag
 from forward_grid_mapper.core.common.errors import BagError
 from forward_grid_mapper.core.common.parameters import Parameters
 from forward_grid_mapper.core.common.readings import in_canonical_order
-from forward_grid_mapper.core.messages.message_types import Pose2
+from forward_grid_mapper.core.messages.message_types import NANOSECONDS, Pose2
 from forward_grid_mapper.files import drawing
 from forward_grid_mapper.recordings.read_drive import read_drive
 
@@ -287,8 +287,11 @@ def test_stamps_of_zero_are_rejected_with_a_remedy(tmp_path: Path, capsys: pytes
     error = error_of_drive(capsys, tmp_path, tape().with_ranges(stamp=0))
     assert f'{COUNT} zero_stamp (header.stamp is 0: set it in the driver)' in error
     # also if a part is mapped
-    error = error_of_drive(capsys, tmp_path / 'part', tape().with_ranges(stamp=0), '--duration', 1)
-    assert f'{COUNT} zero_stamp (header.stamp is 0: set it in the driver)' in error
+    drive = tape()
+    error = error_of_drive(capsys, tmp_path / 'part', drive.with_ranges(stamp=0), '--duration', 1)
+    assert 'in the part --start 0 --duration 1: header.stamp of all readings is 0: set it in the driver' in error
+    span = (drive.odometry[-1].stamp - drive.odometry[0].stamp) / NANOSECONDS
+    assert error.strip().endswith(f'its messages span {span:.1f} s')
 
 
 def test_only_readings_of_a_sensor_without_pose_are_rejected(tmp_path: Path) -> None:

@@ -126,7 +126,7 @@ def match_drive(
         # more trust in readings does not help if nothing had a larger J than odometry
         if make is starts[-1] and best is None:
             break
-        # from walls, J may grow beyond that of the other start in a later round only
+        # from walls, J may grow beyond that of the other start only in a later round
         nodes, beyond = make(), least if start is not None and make is starts[1] else value
         found, reached = _match_repeatedly(odometry, scans, start_stage, nodes, remaining, beyond)
         agreed = best is not None and _agree(best.nodes, reached)
@@ -138,8 +138,8 @@ def match_drive(
         if best is None or known is not None:
             break
         other = scans.with_held_out(held_out(len(scans.windows), begin))
-        nodes, least = scan_matched_with(TRUSTS[0], other), other.objective(other.windows.node)
-        found, reached = _match_repeatedly(odometry, other, start_stage, nodes, remaining, least)
+        nodes, of_odometry = scan_matched_with(TRUSTS[0], other), other.objective(other.windows.node)
+        found, reached = _match_repeatedly(odometry, other, start_stage, nodes, remaining, of_odometry)
         agreed = _agree(best.nodes, reached)
         if found is not None and _objective(scans, found.nodes) > value:
             best, value = found, scans.objective(found.nodes)

@@ -58,7 +58,7 @@ class Attempt(NamedTuple):
     unproven : Attempt or None
         The trajectory that was refused after matching, because it did not show that odometry is wrong.
     start : float64, shape (K, 3), or None
-        Nodes of a trajectory that was refused after matching, from which other methods may start.
+        Nodes of a trajectory that was refused, from which other methods may start.
     matched : bool
         Whether matches and loop closures were used; otherwise readings were predicted worse with them.
     turns_contradicted : bool

@@ -2,8 +2,8 @@
 
 If odometry turns too far at a corner that is not square, walls at right angles look as if they explained it, and the
 trajectory is bent there. Nothing contradicts it before the corner or after it. The readings at the corner do: there the
-robot hears the walls before and after it, so their map is sharp for the right angle of the corner only. So the turn is
-made smaller and larger, and J of the map of these metres is compared.
+robot hears the walls before and after it, so their map is sharp for the true angle only. So the turn is made smaller
+and larger, and J of the map of these metres is compared.
 """
 
 from __future__ import annotations
@@ -59,11 +59,15 @@ def turns_of(windows: Windows, nodes: Floats, least_excess: float = LEAST_EXCESS
     yaw, measured = np.unwrap(nodes[:, 2]), np.unwrap(windows.node[:, 2])
     turned = np.abs(yaw[end] - yaw[begin])
     excess = np.abs(yaw[end] - yaw[begin] - measured[end] + measured[begin])
-    left, out = (turned > LEAST_TURN) & (turned < MOST_TURN), list[int]()
-    # around the middle of a turn, all of it is within reach
-    for middle in np.argsort(-turned, kind='stable').tolist():
-        if left[middle]:
-            left &= np.abs(progress - progress[middle]) > 2 * WITHIN
+    left, out = turned > LEAST_TURN, list[int]()
+    for most in np.argsort(-turned, kind='stable').tolist():
+        if not left[most]:
+            continue
+        # the whole turn is within reach of all nodes around its middle
+        steps = np.abs(np.diff(yaw[begin[most] : end[most] + 1]))
+        middle = int(begin[most] + np.searchsorted(np.cumsum(steps), steps.sum() / 2))
+        left &= np.abs(progress - progress[middle]) > 2 * WITHIN
+        if turned[most] < MOST_TURN:
             out.append(middle)
     out.sort(key=lambda node: -float(excess[node]))
     return [node for node in out if excess[node] >= least_excess][:MOST_TURNS]
@@ -72,7 +76,8 @@ def turns_of(windows: Windows, nodes: Floats, least_excess: float = LEAST_EXCESS
 def gain_of_other_turn(scans: Scans, nodes: Floats, middle: int) -> float:
     """Return by how much J of the map around a node is larger with the best other turn there, nats.
 
-    J depends a little on where surfaces lie in their cells. So it is the mean of two maps, along different axes.
+    J depends a little on where surfaces lie in their cells. So it is the mean of two maps, along different axes. If no
+    other turn is better in the first one, it is half of what that one gives.
     """
     gains = np.zeros(len(CHANGES))
     for frame in (np.zeros(3), nodes[middle]):

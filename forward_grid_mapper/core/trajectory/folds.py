@@ -15,7 +15,7 @@ import numpy as np
 
 from ..common.errors import InputError
 from ..common.readings import Floats
-from .attempt import UNMATCHED, Attempt, Drive, gain_words
+from .attempt import CONTRADICTED, UNMATCHED, Attempt, Drive, gain_words
 from .holding_out import (
     LEAST_SIGMAS,
     OTHERS,
@@ -108,4 +108,6 @@ def _with_gain(attempt: Attempt, better: Gain, folds: int) -> Attempt:
     reason = f'with other windows held out in each of {folds} trials, {gain_words(better)}'
     if not attempt.matched:
         reason += UNMATCHED
+    if attempt.turns_contradicted:
+        reason += CONTRADICTED
     return attempt._replace(refinement=replace(attempt.refinement, reason=reason, gain=better.mean), by_votes=False)

@@ -64,8 +64,8 @@ LEAST_RECOGNISED = 0.85
 """Fraction of the blocks on an earlier visit that are recognised if the trajectory is not bent."""
 
 LEAST_FITTING, FEWEST_RECOGNISED = 0.95, 0.5
-"""Fraction of the blocks on an earlier visit that are recognised, or fit where they lie, if the trajectory is not bent;
-and of those that are recognised."""
+"""Least fraction of the blocks on an earlier visit that are recognised or fit where they lie, if the trajectory is not
+bent; and least fraction that are recognised."""
 
 MORE_RECOGNISED = 2
 """This many more blocks must be recognised at another place."""
@@ -101,7 +101,7 @@ def recognised_part(scans: Scans, nodes: Floats, loops: Sequence[Loop]) -> float
 
 
 def fits_earlier_visits(scans: Scans, nodes: Floats, loops: Sequence[Loop]) -> bool:
-    """Return whether blocks on an earlier visit are recognised or fit there, nearly all of them.
+    """Return whether nearly all blocks on an earlier visit are recognised there or fit there.
 
     A block is not recognised if it looks alike from several poses, as along a bare corridor. It contradicts the
     trajectory only if it does not fit where it lies.

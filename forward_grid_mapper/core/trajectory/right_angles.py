@@ -163,12 +163,12 @@ def at_right_angles(
     # matching takes most of the time, and is left out if nothing supports its result
     if not (walls.proven or walls.votes_suffice or odometry_is_wrong):
         if walls.heading.certainty < LEAST_CERTAINTY:
-            return _heading_lost(drive, walls.heading.certainty)._replace(start=walls.along.nodes)
+            return _heading_lost(drive, walls.heading.certainty, odometry_noise)._replace(start=walls.along.nodes)
         if walls.vote_gain <= LEAST_VOTE_GAIN and not _may_be_proven_at_revisits(drive, walls, start_stage):
             return _unproven(drive, walls, walls.verdict)._replace(before_matching=True)
     found = solve_hypotheses(drive.scans, walls.heading, walls.solver, walls.along, solver_of)
     if found.certainty < LEAST_CERTAINTY:
-        return _heading_lost(drive, found.certainty)._replace(start=found.solution.nodes)
+        return _heading_lost(drive, found.certainty, odometry_noise)._replace(start=found.solution.nodes)
     watch = start_stage('judgement')
     best, verdict = _judged(drive, walls, found, watch)
     attempt = _accepted(drive, best, verdict, walls.heading.drifts.noise, least)
@@ -298,12 +298,11 @@ def _kept(
     return Attempt(refused, drive.windows.node, sure)
 
 
-def _heading_lost(drive: Drive, certainty: float) -> Attempt:
+def _heading_lost(drive: Drive, certainty: float, odometry_noise: float) -> Attempt:
     """Return odometry, since the heading is only this certain."""
-    reason = (
-        f'the heading was lost: it may be wrong by a right angle (probability {1.0 - certainty:.0%}); if you know the '
-        'random error of the yaw of odometry, set odometry_noise'
-    )
+    reason = f'the heading was lost: it may be wrong by a right angle (probability {1.0 - certainty:.0%})'
+    if not odometry_noise:
+        reason += '; if you know the random error of the yaw of odometry, set odometry_noise'
     refused = Refinement(False, reason, drive.readings, drive.odometry, {}, lost=True)
     return Attempt(refused, drive.windows.node)
 

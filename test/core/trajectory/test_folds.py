@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from forward_grid_mapper.core.common.errors import InputError
 from forward_grid_mapper.core.common.readings import Floats
 from forward_grid_mapper.core.trajectory import folds, holding_out
-from forward_grid_mapper.core.trajectory.attempt import UNMATCHED, Attempt, Drive
+from forward_grid_mapper.core.trajectory.attempt import CONTRADICTED, UNMATCHED, Attempt, Drive
 from forward_grid_mapper.core.trajectory.folds import NEARLY, OTHERS, accepted_in_folds
 from forward_grid_mapper.core.trajectory.holding_out import EVERY, LEAST_SIGMAS, held_out
 from forward_grid_mapper.core.trajectory.outcome import Refinement
@@ -105,6 +105,14 @@ def test_walls_alone_are_named_by_the_folds_as_well(scans, monkeypatch, matched:
     monkeypatch.setattr(trial, 'attempt', lambda number: attempt(number)._replace(matched=matched))
     found = trial.judged()
     assert found is not None and found.refinement.reason.endswith(UNMATCHED) != matched
+
+
+def test_contradicted_turns_are_named_by_the_folds_as_well(scans, monkeypatch) -> None:
+    trial = Folds(monkeypatch, scans, [ENOUGH, ENOUGH])
+    attempt = trial.attempt
+    monkeypatch.setattr(trial, 'attempt', lambda number: attempt(number)._replace(turns_contradicted=True))
+    found = trial.judged()
+    assert found is not None and found.refinement.reason.endswith(CONTRADICTED)
 
 
 def test_first_fold_is_taken_if_the_map_of_the_whole_drive_is_too_large(scans, monkeypatch) -> None:

@@ -449,7 +449,8 @@ def test_matching_may_start_from_a_refused_trajectory_that_comes_back(
 
 
 def test_matching_may_start_from_straight_walls_if_the_heading_was_lost(bent, monkeypatch) -> None:
-    starts: list[Floats | None] = []
+    starts, along_walls, solve = list[Floats | None](), list[Solution](), Solver.along_walls
+    monkeypatch.setattr(Solver, 'along_walls', lambda solver: along_walls.append(solve(solver)) or along_walls[-1])
     monkeypatch.setattr(refinement, 'match_drive', lambda *rest: starts.append(rest[5]))
     monkeypatch.setattr(right_angles, 'gain_over_drive', lambda *rest: Gain(0.0, 0.01))
     monkeypatch.setattr(right_angles, 'LEAST_VOTE_GAIN', np.inf)
@@ -457,8 +458,7 @@ def test_matching_may_start_from_straight_walls_if_the_heading_was_lost(bent, mo
     found = Refiner(Parameters()).run(*bent)
     assert not found.accepted and found.lost
     assert 'it may be wrong by a right angle' in found.reason and 'set odometry_noise' in found.reason
-    (start,) = starts
-    assert start is not None
+    assert [start is solution.nodes for start, solution in zip(starts, along_walls, strict=True)] == [True]
 
 
 @pytest.mark.parametrize('accepted', [False, True])
@@ -504,7 +504,8 @@ def test_walls_whose_turns_are_contradicted_are_not_taken_after_all(bent, monkey
         monkeypatch.setattr(refinement, 'gain_at_revisits', lambda *rest, gains=gains: next(gains))
         assert Refiner(Parameters()).run(readings, odometry).reason.startswith('walls;') == (sigmas == 0.0)
     contradicted = True
-    monkeypatch.setattr(refinement, 'gain_at_revisits', lambda *rest: Gain(5.0, 0.1))
+    gains = iter([Gain(5.0, 0.1), Gain(0.0, 1.0)])
+    monkeypatch.setattr(refinement, 'gain_at_revisits', lambda *rest: next(gains))
     assert Refiner(Parameters()).run(readings, odometry).reason.startswith('walls are not assumed')
 
 

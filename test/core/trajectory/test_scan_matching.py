@@ -281,17 +281,6 @@ def test_matches_alone_replace_walls_only_with_a_much_larger_j(
     assert before is attempt.nodes and after is matched
 
 
-def as_if_square(nodes: Floats, true: Floats) -> Floats:
-    """The nodes, turned at each corner of the true path as if it was a right angle."""
-    corner = np.cumsum(np.abs(np.diff(true[:, 2], prepend=true[0, 2]))) // math.radians(72.0)
-    steps = relative(nodes[:-1], nodes[1:])
-    steps[:, 2] += np.diff(corner) * math.radians(18.0)
-    square = nodes[:1]
-    for step in steps:
-        square = np.concatenate([square, compose(square[-1:], step[None])])
-    return square
-
-
 def test_j_of_a_contradictory_trajectory_is_smaller_by_many_errors(exact, bent, scans) -> None:
     true = odometry_of(exact).at(scans.windows.node_stamp)
     gain_of_true = gain_of_objective(scans, scans.windows.node, true)
