@@ -119,16 +119,16 @@ def match_drive(
     def scan_matched_with(trust: Trust, scans: Scans = scans) -> Floats:
         return scan_matched(scans, trust._replace(yaw=noise or trust.yaw), start_stage('scan matching'))
 
-    starts: list[Callable[[], Floats]] = [partial(scan_matched_with, trust) for trust in TRUSTS]
+    starts: list[tuple[Callable[[], Floats], bool]] = [(partial(scan_matched_with, trust), False) for trust in TRUSTS]
     if start is not None:
-        starts.insert(1, lambda: start)
-    for make in starts:
+        starts.insert(1, (lambda: start, True))
+    for make, from_walls in starts:
         # more trust in readings does not help if nothing had a larger J than odometry
-        if make is starts[-1] and best is None:
+        if make is starts[-1][0] and best is None:
             break
         # from walls, J may grow beyond that of the other start only in a later round
-        nodes, beyond = make(), least if start is not None and make is starts[1] else value
-        found, reached = _match_repeatedly(odometry, scans, start_stage, nodes, remaining, beyond)
+        beyond = least if from_walls else value
+        found, reached = _match_repeatedly(odometry, scans, start_stage, make(), remaining, beyond)
         agreed = best is not None and _agree(best.nodes, reached)
         if found is not None and found.value > value:
             best, value = found, found.value

@@ -121,8 +121,7 @@ def _fits(scans: Scans, nodes: Floats, number: int, places: Places, least: float
     """Return whether a block fits on its nearest earlier visit, by at least so many nats a reading."""
     progress, block = scans.windows.node_progress, windows_of(np.array([number]), len(nodes))
     middle = int(block[len(block) // 2])
-    before = np.arange(0, len(nodes), SHARED)
-    before = before[progress[before] < progress[middle] - APART]
+    before = _places_before(progress, middle)
     place = int(before[np.hypot(*(nodes[before, :2] - nodes[middle, :2]).T).argmin()])
     around, joint = places[place], scans.joint(block, relative(nodes[middle], nodes[block]))
     if around is None or not len(joint.readings):
@@ -215,11 +214,17 @@ def _best_pose(joint: Scan, around: LocalMap) -> Floats:
     return best
 
 
+def _places_before(progress: Floats, node: int) -> NDArray[np.int64]:
+    """Return the nodes of places on earlier visits than that of a node."""
+    places = np.arange(0, len(progress), SHARED)
+    out: NDArray[np.int64] = places[progress[places] < progress[node] - APART]
+    return out
+
+
 def loops_at(scans: Scans, nodes: Floats, stretch: NDArray[np.int64], usual: float) -> list[Loop]:
     """Return the loop closures of the blocks of a stretch with earlier visits, near the given nodes."""
-    progress, places, out = scans.windows.node_progress, Places(scans, nodes), []
-    before = np.arange(0, len(nodes), SHARED)
-    before = before[progress[before] < progress[stretch[0]] - APART]
+    places, out = Places(scans, nodes), []
+    before = _places_before(scans.windows.node_progress, int(stretch[0]))
     for first in range(0, len(stretch), LENGTH):
         block = stretch[first : first + LENGTH]
         middle = block[len(block) // 2]

@@ -389,11 +389,11 @@ def _accepted(drive: Drive, best: _Candidate, verdict: _Verdict, noise: float, l
         noise=noise,
     )
     sure = not contradicted and fits_earlier_visits(scans, best.nodes, best.loops)
-    sure = sure and not (verdict.by_votes and _is_contradicted(drive, best.nodes))
+    sure = sure and not (verdict.by_votes and _has_smaller_objective(drive, best.nodes))
     return Attempt(outcome, best.nodes, sure, verdict.by_votes, matched=best.matched, turns_contradicted=contradicted)
 
 
-def _is_contradicted(drive: Drive, nodes: Floats) -> bool:
+def _has_smaller_objective(drive: Drive, nodes: Floats) -> bool:
     """Return whether J is clearly smaller than with odometry, although the trajectory was fitted to the readings."""
     try:
         return gain_of_objective(drive.scans, drive.windows.node, nodes).sigmas <= -LEAST_SIGMAS

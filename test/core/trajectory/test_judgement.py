@@ -481,29 +481,36 @@ def test_turns_that_readings_contradict_are_said_and_changed_before_matching(
     np.testing.assert_array_equal(starts[0], changed[0] + 1.0)
 
 
-def test_walls_whose_turns_are_contradicted_are_not_taken_after_all(bent, monkeypatch) -> None:
-    readings, odometry = bent
-    contradicted = False
+def let_walls_be_unproven(
+    monkeypatch, readings: Readings, odometry: Odometry, turns_contradicted: bool = False
+) -> None:
+    """Let walls give a trajectory that does not show that odometry is wrong, and let no gain decide."""
 
     def at_right_angles(drive: Drive, *rest) -> Attempt:
         outcome = Refinement(True, 'walls', readings, odometry, {})
-        walls = Attempt(outcome, drive.windows.node * (1.2, 1.0, 1.0), turns_contradicted=contradicted)
+        walls = Attempt(outcome, drive.windows.node * (1.2, 1.0, 1.0), turns_contradicted=turns_contradicted)
         return Attempt(replace(outcome, accepted=False), drive.windows.node, unproven=walls)
 
-    def matched(odometry: Odometry, scans: Scans, *rest) -> MatchedDrive:
-        return MatchedDrive(scans.windows.node * (1.1, 1.0, 1.0), [], 0.0, 1.0, scans)
-
     monkeypatch.setattr(refinement, 'at_right_angles', at_right_angles)
-    monkeypatch.setattr(refinement, 'match_drive', matched)
     let_come_back(monkeypatch, lambda *rest: True)
     monkeypatch.setattr(refinement, 'confirmed_by_places', lambda *rest: True)
     monkeypatch.setattr(refinement, 'gain_within_visits', lambda *rest: Gain(0.0, 0.1))
     monkeypatch.setattr(refinement, 'gain_when_fitted', lambda *rest: Gain(0.0, 0.1))
+
+
+def test_walls_whose_turns_are_contradicted_are_not_taken_after_all(bent, monkeypatch) -> None:
+    readings, odometry = bent
+
+    def matched(odometry: Odometry, scans: Scans, *rest) -> MatchedDrive:
+        return MatchedDrive(scans.windows.node * (1.1, 1.0, 1.0), [], 0.0, 1.0, scans)
+
+    monkeypatch.setattr(refinement, 'match_drive', matched)
+    let_walls_be_unproven(monkeypatch, readings, odometry)
     for sigmas in (50.0, 0.0):
         gains = iter([Gain(5.0, 0.1), Gain(sigmas, 1.0)])
         monkeypatch.setattr(refinement, 'gain_at_revisits', lambda *rest, gains=gains: next(gains))
         assert Refiner(Parameters()).run(readings, odometry).reason.startswith('walls;') == (sigmas == 0.0)
-    contradicted = True
+    let_walls_be_unproven(monkeypatch, readings, odometry, turns_contradicted=True)
     gains = iter([Gain(5.0, 0.1), Gain(0.0, 1.0)])
     monkeypatch.setattr(refinement, 'gain_at_revisits', lambda *rest: next(gains))
     assert Refiner(Parameters()).run(readings, odometry).reason.startswith('walls are not assumed')
@@ -513,11 +520,6 @@ def test_walls_whose_turns_are_contradicted_are_not_taken_after_all(bent, monkey
 def test_matched_trajectory_is_judged_by_the_windows_that_were_held_out(bent, monkeypatch, own_fold: bool) -> None:
     (readings, odometry), judged_by, after_all = bent, list[Scans](), list[Scans]()
 
-    def at_right_angles(drive: Drive, *rest) -> Attempt:
-        outcome = Refinement(True, 'walls', readings, odometry, {})
-        walls = Attempt(outcome, drive.windows.node * (1.2, 1.0, 1.0))
-        return Attempt(replace(outcome, accepted=False), drive.windows.node, unproven=walls)
-
     def matched(odometry: Odometry, scans: Scans, *rest) -> MatchedDrive:
         mine = scans if own_fold else scans.with_held_out(held_out(len(scans.windows), 0))
         return MatchedDrive(scans.windows.node * (1.1, 1.0, 1.0), [], 0.0, 1.0, mine)
@@ -526,12 +528,8 @@ def test_matched_trajectory_is_judged_by_the_windows_that_were_held_out(bent, mo
         (judged_by if before is scans.windows.node else after_all).append(scans)
         return Gain(1.0, 0.1)
 
-    monkeypatch.setattr(refinement, 'at_right_angles', at_right_angles)
     monkeypatch.setattr(refinement, 'match_drive', matched)
-    let_come_back(monkeypatch, lambda *rest: True)
-    monkeypatch.setattr(refinement, 'confirmed_by_places', lambda *rest: True)
-    monkeypatch.setattr(refinement, 'gain_within_visits', lambda *rest: Gain(0.0, 0.1))
-    monkeypatch.setattr(refinement, 'gain_when_fitted', lambda *rest: Gain(0.0, 0.1))
+    let_walls_be_unproven(monkeypatch, readings, odometry)
     monkeypatch.setattr(refinement, 'gain_at_revisits', gain_at_revisits)
     found = Refiner(Parameters()).run(readings, odometry)
     begin = EVERY // 2 if own_fold else 0
