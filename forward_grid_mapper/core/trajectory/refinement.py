@@ -142,7 +142,8 @@ class Refiner:
         try:
             noise = self._parameters.association.odometry_noise
             start = start_from(scans, by_walls) if by_walls.turns_contradicted else by_walls.start
-            found = match_drive(odometry, scans, self._start_stage, noise, known, start)
+            limit = None if by_walls.turns_contradicted else known
+            found = match_drive(odometry, scans, self._start_stage, noise, limit, start)
         except InputError:
             # at the cell size of matching, the map of the whole drive may be too large although the final maps are not
             found = None

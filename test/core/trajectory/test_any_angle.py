@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 
 import numpy as np
@@ -13,8 +12,7 @@ from forward_grid_mapper.core.common.errors import InputError
 from forward_grid_mapper.core.common.readings import Floats
 from forward_grid_mapper.core.trajectory import any_angle, scan_matching
 from forward_grid_mapper.core.trajectory import scans as scans_module
-from forward_grid_mapper.core.trajectory.any_angle import MatchedDrive
-from forward_grid_mapper.core.trajectory.holding_out import Gain, held_out
+from forward_grid_mapper.core.trajectory.holding_out import held_out
 from forward_grid_mapper.core.trajectory.loops import Loop
 from forward_grid_mapper.core.trajectory.matching import Match
 from forward_grid_mapper.core.trajectory.odometry_model import CALIBRATION
@@ -23,7 +21,6 @@ from forward_grid_mapper.core.trajectory.pose_graph import Solution, solution_at
 from forward_grid_mapper.core.trajectory.poses import compose, relative
 from forward_grid_mapper.core.trajectory.scan_matching import TRUSTS, Trust
 from forward_grid_mapper.core.trajectory.scans import Scans
-from forward_grid_mapper.simulation.drift import odometry_of
 
 
 class Trials:
@@ -47,6 +44,7 @@ class Trials:
         others: tuple[int, ...] = (),
     ) -> None:
         monkeypatch.setattr(any_angle, 'OTHERS', others)
+        monkeypatch.setattr(any_angle, 'at_likeliest_scale', lambda scans, nodes, watch: (nodes, 1.0))
         # otherwise all starts would agree
         monkeypatch.setattr(any_angle, 'AGREED', 0.0)
         self.calls: list[tuple[Floats, float]] = []
@@ -92,6 +90,8 @@ def test_map_of_the_whole_drive_is_made_once_for_the_same_nodes(scans, monkeypat
     [
         ([(0.96, 1.0)], 1),
         ([(0.5, 1.0), (0.96, 2.0)], 2),
+        # it may begin below that of odometry
+        ([(0.5, -1.0), (0.96, 2.0)], 2),
         # if J does not grow in a round, another trust is tried
         ([(0.5, 1.0), (0.5, 0.5), (0.96, 3.0)], 1),
         ([(0.5, 1.0), (0.5, 2.0), (0.96, 1.5), (0.96, 1.0)], 2),
@@ -125,10 +125,15 @@ def test_round_whose_map_would_be_too_large_is_the_last(bent, scans, monkeypatch
     assert (len(trials.calls), found.value) == (3, 1.0)
 
 
-def test_without_gain_over_odometry_no_more_rounds_are_tried(bent, scans, monkeypatch) -> None:
-    trials = Trials(monkeypatch, [(0.5, -1.0)])
+@pytest.mark.parametrize(
+    'values', [[(0.96, -1.0)], [(0.5, -2.0), (0.5, -3.0)], [(0.5, -2.0), (0.5, -1.0), (0.5, -2.0)]]
+)
+def test_without_gain_over_odometry_no_other_scan_matching_is_tried(
+    bent, scans, monkeypatch, values: list[tuple[float, float]]
+) -> None:
+    trials = Trials(monkeypatch, values)
     assert any_angle.match_drive(bent[1], scans, lambda stage: quietly) is None
-    assert len(trials.calls) == 1
+    assert len(trials.calls) == len(values)
 
 
 def test_round_that_moves_nothing_is_the_last(bent, scans, monkeypatch) -> None:
@@ -158,11 +163,12 @@ def test_rounds_end_early_below_the_j_of_a_known_trajectory(bent, scans, monkeyp
 @pytest.mark.parametrize(
     ('values', 'begins', 'value'),
     [
-        # nothing more is tried if most places are recognised
-        ([(0.96, 1.0)], [0.0], 1.0),
+        # also if most places are recognised from the first
+        ([(0.96, 1.0), (0.96, 0.5)], [0.0, 5.0], 1.0),
+        ([(0.96, 1.0), (0.96, 2.0)], [0.0, 5.0], 2.0),
         ([(0.5, 1.0), (0.5, 0.5), (0.96, 3.0)], [0.0, 1.0, 5.0], 3.0),
         ([(0.5, 1.0), (0.5, 0.5), (0.5, 0.5), (0.5, 0.2), (0.96, 3.0)], [0.0, 1.0, 5.0, 6.0, 0.0], 3.0),
-        # from given nodes, J may grow beyond that of the first start in a later round
+        # J may grow beyond that of the first start in a later round
         ([(0.5, 2.0), (0.5, 0.5), (0.5, 1.0), (0.96, 3.0)], [0.0, 1.0, 5.0, 6.0], 3.0),
         ([(0.5, 2.0), (0.5, 0.5), (0.5, 1.0), (0.96, 1.5), (0.96, 1.5)], [0.0, 1.0, 5.0, 6.0, 0.0], 2.0),
         # also if J of the first is no larger than that of odometry
@@ -225,7 +231,7 @@ def test_search_that_got_lost_is_repeated_with_other_windows_held_out(
     ('values', 'moves', 'value'),
     [
         # the second start leads to the same trajectory, with a smaller J, and with a larger one
-        ([(0.5, 2.0), (0.5, 1.0), (0.5, 1.5)], [1.0, 0.0, 1.1], 2.0),
+        ([(0.5, 2.0), (0.5, 1.0), (0.9, 1.5)], [1.0, 0.0, 1.1], 2.0),
         ([(0.9, 2.0), (0.9, 3.0)], [1.0, 1.1], 3.0),
         # only that of the second other fold does
         ([(0.9, 2.0), (0.9, 1.5), (0.9, 1.0), (0.9, 1.0)], [1.0, 9.0, 5.0, 1.1], 2.0),
@@ -250,150 +256,56 @@ def test_trajectories_agree_if_only_their_sizes_differ(scans) -> None:
     assert not any_angle._agree(nodes, bent)
 
 
-def scaled_from(scans: Scans, nodes: Floats, loops: Sequence[Loop] = ()) -> MatchedDrive:
-    """Return the drive at the best scale, and the same object if this is the one that it has."""
-    found = MatchedDrive(nodes, [*loops], scans.objective(nodes), 1.0, scans)
-    moved = any_angle._scaled(found, lambda part: None)
-    assert (moved is found) == (moved.nodes is nodes)
-    return moved
+class Scales:
+    """Makes drives larger by a factor, and records what it gets."""
+
+    def __init__(self, monkeypatch, factor: float) -> None:
+        self.factor, self.seen = factor, list[Floats]()
+        monkeypatch.setattr(any_angle, 'at_likeliest_scale', self._scaled)
+
+    def _scaled(self, scans: Scans, nodes: Floats, watch: Progress) -> tuple[Floats, float]:
+        self.seen.append(nodes)
+        return nodes * [self.factor, self.factor, 1.0], self.factor
 
 
-@pytest.mark.parametrize('factor', [0.9, 1.1])
-def test_wrong_scale_of_a_drive_is_found_by_its_objective(exact, scans, factor: float) -> None:
-    true = odometry_of(exact).at(scans.windows.node_stamp)
-    wrong = np.column_stack([factor * true[:, :2], true[:, 2]])
-    moved = scaled_from(scans, wrong)
-    found = moved.nodes
-    assert moved.value == scans.objective(found)
-    scale = np.hypot(*(found[-1, :2] - found[0, :2])) / np.hypot(*(true[-1, :2] - true[0, :2]))
-    assert scale == pytest.approx(1.0, abs=0.02)
-    assert np.array_equal(found[0], wrong[0])
-    assert np.array_equal(found[:, 2], wrong[:, 2])
-
-
-def test_right_scale_of_a_drive_is_kept(exact, scans) -> None:
-    true = odometry_of(exact).at(scans.windows.node_stamp)
-    assert scaled_from(scans, true).nodes is true
-
-
-class Scaled:
-    """A drive whose J is a parabola of the logarithm of its scale."""
-
-    def __init__(self, monkeypatch, best: float, *sigmas: float) -> None:
-        self.nodes = np.array([[1.0, 2.0, 0.3], [4.0, 6.0, 0.5]])
-        self._best = best
-        self.fitted: list[tuple[Floats, Floats]] = []
-        monkeypatch.setattr(any_angle, 'gain_of_objective', lambda *rest: Gain(sigmas[0], 1.0))
-
-        def gain_of_fitted(scans: Scans, before: Floats, after: Floats, watch: Progress) -> Gain:
-            self.fitted.append((before, after))
-            return Gain(sigmas[-1], 1.0)
-
-        monkeypatch.setattr(any_angle, 'gain_of_fitted', gain_of_fitted)
-
-    def objective(self, nodes: Floats) -> float:
-        scale = np.hypot(*(nodes[1] - nodes[0])[:2]) / 5.0
-        return -100.0 * (math.log(scale / self._best) / math.log(any_angle.SCALE_STEP)) ** 2
-
-    def scale(self) -> float:
-        found = scaled_from(self, self.nodes).nodes  # type: ignore[arg-type]
-        return float(np.hypot(*(found[1] - found[0])[:2])) / 5.0
-
-
-@pytest.mark.parametrize(
-    ('best', 'sigmas', 'scale'),
-    [
-        (1.07, 3.0, 1.07),
-        (0.91, 3.0, 0.91),
-        (1.02, 3.0, 1.02),
-        # a change of less than half a step, one that is not proven, and one that is too large
-        (1.01, 3.0, 1.0),
-        (1.07, 2.0, 1.0),
-        (1.4, 3.0, 1.0),
-    ],
-)
-def test_scale_is_the_top_of_the_objective_if_that_is_clear(
-    monkeypatch, best: float, sigmas: float, scale: float
-) -> None:
-    assert Scaled(monkeypatch, best, sigmas).scale() == pytest.approx(scale)
-
-
-@pytest.mark.parametrize(('sigmas', 'scale'), [((0.96, 3.0), 1.0), ((2.2, 2.2), 1.0), ((1.0, 2.3), 1.07)])
-def test_both_are_fitted_if_the_scale_may_be_wrong(monkeypatch, sigmas: tuple[float, ...], scale: float) -> None:
-    drive = Scaled(monkeypatch, 1.07, *sigmas)
-    assert drive.scale() == pytest.approx(scale)
-    assert len(drive.fitted) == (sigmas[0] >= any_angle.WORTH_FITTING)
-    for pair in drive.fitted:
-        sizes = [np.hypot(*(nodes[1] - nodes[0])[:2]) / 5.0 for nodes in pair]
-        assert sizes == pytest.approx([1.0, 1.07])
-
-
-def test_scale_is_kept_if_the_map_of_a_fitted_trajectory_would_be_too_large(monkeypatch) -> None:
-    drive, asked = Scaled(monkeypatch, 1.07, 2.0), list[Floats]()
-
-    def gain_of_fitted(scans: Scans, before: Floats, after: Floats, watch: Progress) -> Gain:
-        asked.append(after)
-        raise InputError('the map would be too large')
-
-    monkeypatch.setattr(any_angle, 'gain_of_fitted', gain_of_fitted)
-    assert drive.scale() == 1.0
-    assert len(asked) == 1
-
-
-def test_scale_whose_map_would_be_too_large_is_not_taken(exact, scans, monkeypatch) -> None:
-    true = odometry_of(exact).at(scans.windows.node_stamp)
-    wrong, objective = np.column_stack([0.9 * true[:, :2], true[:, 2]]), Scans.objective
-    widest = np.ptp(wrong[:, 0]) * 1.05
-
-    def limited(s: Scans, nodes: Floats) -> float:
-        if np.ptp(nodes[:, 0]) > widest:
-            raise InputError('the map would be too large')
-        return objective(s, nodes)
-
-    monkeypatch.setattr(Scans, 'objective', limited)
-    found = scaled_from(scans, wrong).nodes
-    assert np.ptp(found[:, 0]) == pytest.approx(np.ptp(wrong[:, 0]) * any_angle.SCALE_STEP)
-
-
-def test_next_round_holds_the_scale_that_was_found(bent, scans, monkeypatch) -> None:
-    trials = Trials(monkeypatch, [(0.96, 1.0), (0.96, 2.0)], far=0.0)
-    larger = scans.windows.node * [1.05, 1.05, 1.0]
-
-    def scaled(found: MatchedDrive, watch: Progress) -> MatchedDrive:
-        return found._replace(nodes=larger) if len(trials.calls) == 1 else found
-
-    monkeypatch.setattr(any_angle, '_scaled', scaled)
+@pytest.mark.parametrize(('values', 'value'), [([1.0, 2.0], 2.0), ([1.0, 0.9], 1.0)])
+def test_next_round_holds_the_scale_that_was_found(bent, scans, monkeypatch, values: list[float], value: float) -> None:
+    trials, scales = Trials(monkeypatch, [(0.96, each) for each in values], far=0.0), Scales(monkeypatch, 1.05)
     found = any_angle.match_drive(bent[1], scans, lambda stage: quietly)
     assert found is not None
-    assert len(trials.calls) == 2
-    assert found.nodes == pytest.approx(larger)
+    # nothing is matched again unless J grows, and the scale is not examined again
+    assert (found.value, len(trials.calls), len(scales.seen)) == (value, 2, 1)
+    assert found.nodes == pytest.approx(scans.windows.node * [1.05, 1.05, 1.0])
     assert not trials.change[:, :, CALIBRATION.index('scale')].any()
     assert trials.change[:, :, CALIBRATION.index('bias')].any()
 
 
-def test_first_round_at_another_scale_searches_near_the_loop_closures_before(bent, scans, monkeypatch) -> None:
-    trials = Trials(monkeypatch, [(0.96, 1.0), (0.5, 2.0), (0.96, 3.0)])
-    before, now, examined = Loop(40, 3, Matches()), Loop(40, 3, Matches()), list[MatchedDrive]()
-    trials.loops = [before]
-
-    def scaled(found: MatchedDrive, watch: Progress) -> MatchedDrive:
-        examined.append(found)
-        assert found.loops == [before]
-        return found._replace(nodes=found.nodes * [1.05, 1.05, 1.0], loops=[now])
-
-    monkeypatch.setattr(any_angle, '_scaled', scaled)
+def test_drive_at_the_right_scale_is_not_matched_again(bent, scans, monkeypatch) -> None:
+    trials = Trials(monkeypatch, [(0.96, 1.0)], far=0.0)
+    Scales(monkeypatch, 1.0)
     found = any_angle.match_drive(bent[1], scans, lambda stage: quietly)
     assert found is not None
-    assert [list(loops) for loops in trials.found_before] == [[], [now], []]
-    # the scale is examined once more at the end, without another round
-    assert len(examined) == 2
-    assert found.nodes[1, :2] == pytest.approx(1.05**2 * scans.windows.node[1, :2])
+    assert (found.value, len(trials.calls)) == (1.0, 1)
 
 
-def test_loop_closures_are_scaled_with_the_drive(monkeypatch) -> None:
-    drive, matches = Scaled(monkeypatch, 1.07, 3.0), Matches()
+def test_only_the_best_drive_is_scaled(bent, scans, monkeypatch) -> None:
+    Trials(monkeypatch, [(0.5, 2.0), (0.5, 1.5), (0.96, 1.0), (0.96, 2.5)], [1.0, 0.0, 5.0, 0.0])
+    scales = Scales(monkeypatch, 1.05)
+    found = any_angle.match_drive(bent[1], scans, lambda stage: quietly)
+    assert found is not None
+    assert [nodes[-1, 0] - scans.windows.node[-1, 0] for nodes in scales.seen] == pytest.approx([1.0])
+    assert found.value == 2.5
+
+
+def test_first_round_at_another_scale_searches_near_the_loop_closures_before(bent, scans, monkeypatch) -> None:
+    trials, matches = Trials(monkeypatch, [(0.96, 1.0), (0.5, 2.0), (0.96, 3.0)]), Matches()
     matches.add(3, 40, Match(np.array([0.5, -0.2, 0.1]), np.eye(3), 30.0), 20)
-    found = scaled_from(drive, drive.nodes, [Loop(40, 3, matches)])  # type: ignore[arg-type]
-    assert found.loops[0].matches.edges().pose[0] == pytest.approx([0.535, -0.214, 0.1])
-    assert found.loops[0].matches.mean_score == matches.mean_score
+    trials.loops = [Loop(40, 3, matches)]
+    Scales(monkeypatch, 1.07)
+    assert any_angle.match_drive(bent[1], scans, lambda stage: quietly) is not None
+    assert [len(loops) for loops in trials.found_before] == [0, 1, 0]
+    # places lie in the frames of nodes, so they move apart as the drive does
+    now = trials.found_before[1][0].matches
+    assert now.edges().pose[0] == pytest.approx([0.535, -0.214, 0.1])
+    assert now.mean_score == matches.mean_score
     assert matches.edges().pose[0] == pytest.approx([0.5, -0.2, 0.1])
