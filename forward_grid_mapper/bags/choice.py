@@ -111,11 +111,19 @@ def choose_range_topics(contents: Contents, range_topics: Sequence[str] | None) 
     else:
         ranges = tuple(dict.fromkeys(_named(contents, topic, (RANGE,), '--range-topics') for topic in range_topics))
     if not ranges:
-        raise BagError(
-            'The bag has no sensor_msgs/Range messages. LaserScan, PointCloud and other types are not read: publish '
-            f'each reading of a sonar as a Range. {_listing(contents)}'
-        )
+        raise BagError(f'The bag has no sensor_msgs/Range messages. {_without_ranges(contents)} {_listing(contents)}')
     return ranges
+
+
+def _without_ranges(contents: Contents) -> str:
+    """Return the remedy for a bag without ranges."""
+    empty = sum(kind == RANGE for kind, _ in contents.values())
+    if empty:
+        return (
+            f'{counted(empty, "topic")} of this type {"was" if empty == 1 else "were"} recorded, but nothing was '
+            'published there: did the drivers of the sonars run, and do the QoS settings of the recorder match theirs?'
+        )
+    return 'LaserScan, PointCloud and other types are not read: publish each reading of a sonar as a Range.'
 
 
 def _choosing(odometry: str, found: Sequence[str], ranges: Sequence[str]) -> str:

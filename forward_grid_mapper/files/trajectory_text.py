@@ -14,6 +14,9 @@ from ..core.trajectory.windows import Odometry
 LEAST_SCALE, LEAST_ANGLE = 0.003, math.radians(0.1)
 """Smallest values of the calibration that are mentioned: fractions, and radians or radians a metre."""
 
+CLEAR = 2.0
+"""An error of odometry is stated from so many standard deviations on."""
+
 
 def tum_text(trajectory: Odometry) -> str:
     """Return a line for each pose, `stamp x y z qx qy qz qw` in seconds and metres, the format that evo reads."""
@@ -82,7 +85,7 @@ def estimate_words(estimates: Mapping[str, CalibrationEstimate]) -> str:
     """Return the errors of odometry that the drive determines, each with its standard deviation, in words."""
     words = []
     for name, (value, sigma) in estimates.items():
-        said = calibration_words({name: value}) if abs(value) > sigma else ''
+        said = calibration_words({name: value}) if abs(value) > CLEAR * sigma else ''
         if not said:
             said = f'{_EXACT[name]} within the accuracy'
         error = math.degrees(sigma) if name in ('bias', 'heading') else 100 * sigma / (1 + value) ** 2

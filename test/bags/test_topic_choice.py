@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 from bag_samples import START, write_sample
 
-from forward_grid_mapper.bags.choice import Topics
+from forward_grid_mapper.bags.choice import Topics, choose_range_topics
 from forward_grid_mapper.bags.reader import Bag
 from forward_grid_mapper.bags.writer import BagWriter
 from forward_grid_mapper.core.common.errors import BagError
@@ -67,3 +67,17 @@ def test_bag_without_ranges_or_odometry_is_rejected(tmp_path: Path) -> None:
             assert '--poses' not in str(caught.value)
     with Bag(tmp_path / 'c') as bag, pytest.raises(BagError, match='no topics at all'):
         bag.choose_topics()
+
+
+@pytest.mark.parametrize(
+    ('counts', 'remedy'),
+    [
+        ((), 'LaserScan, PointCloud and other types are not read'),
+        ((0,), '1 topic of this type was recorded, but nothing was published there'),
+        ((0, 0), '2 topics of this type were recorded, but nothing was published there'),
+    ],
+)
+def test_bag_without_ranges_is_told_from_one_whose_sonars_were_silent(counts: tuple[int, ...], remedy: str) -> None:
+    contents = {f'/sonar_{k}': ('sensor_msgs/msg/Range', count) for k, count in enumerate(counts)}
+    with pytest.raises(BagError, match=f'no sensor_msgs/Range messages. {remedy}'):
+        choose_range_topics({**contents, '/odom': ('nav_msgs/msg/Odometry', 3)}, None)

@@ -46,6 +46,13 @@ def test_calibration_in_words() -> None:
     assert estimate_words({'scale': CalibrationEstimate(0.25, 0.025)}).startswith(
         'distances are measured 20.0 % too short (± 1.6 %)'
     )
+    # less than two standard deviations are no error
+    assert estimate_words({'heading': CalibrationEstimate(math.radians(0.5), math.radians(0.3))}).startswith(
+        'the robot drives along its heading within the accuracy (± 0.3°)'
+    )
+    assert estimate_words({'heading': CalibrationEstimate(math.radians(0.5), math.radians(0.2))}).startswith(
+        'the robot drives 0.5° to the left of its heading (± 0.2°)'
+    )
     assert '1.0° to the right of' in calibration_words({'heading': -math.radians(1.0)})
 
 

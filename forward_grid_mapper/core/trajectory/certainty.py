@@ -56,10 +56,10 @@ FEWEST_BLOCKS = 8
 FARTHEST_TOP = 2.0
 """Largest distance of the top of the parabola from the middle, steps."""
 
-LEAST_SIGMA = {'scale': 0.004, 'heading': math.radians(0.3), 'bias': math.radians(0.05), 'turn_scale': 0.003}
-"""Added to σ in quadrature."""
+LEAST_SIGMA = {'scale': 0.01, 'heading': math.radians(0.3), 'bias': math.radians(0.05), 'turn_scale': 0.003}
+"""Added to σ in quadrature; along true poses, readings are likeliest at a scale that is off by about so much."""
 
-LARGEST_SIGMA = {'scale': 0.012, 'heading': math.radians(0.6), 'bias': math.radians(0.5), 'turn_scale': 0.015}
+LARGEST_SIGMA = {'scale': 0.015, 'heading': math.radians(0.6), 'bias': math.radians(0.5), 'turn_scale': 0.015}
 """Values with a larger σ are not determined by the drive, and are left out."""
 
 
