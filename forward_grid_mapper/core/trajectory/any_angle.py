@@ -20,7 +20,7 @@ from ..common.errors import InputError
 from ..common.readings import Floats
 from .holding_out import OTHERS, held_out
 from .loops import Loop
-from .odometry_model import CALIBRATION, sensitivity
+from .odometry_model import CALIBRATION, log_likelihood_of_yaw, sensitivity
 from .passes import Progress
 from .pose_graph import solution_at
 from .poses import relative, rms_after_alignment
@@ -31,8 +31,8 @@ from .scans import Scans
 from .solving import SETTLED, MatchSolver
 from .windows import Odometry
 
-REMAINING_YAW_NOISE = math.radians(3.0)
-"""σ of the yaw error after scan matching, and after each round, radians a √metre."""
+REMAINING_YAW_NOISE, SMALL_YAW_NOISE = math.radians(3.0), math.radians(1.0)
+"""σ of the yaw error after scan matching, and after each round, radians a √metre; and that of good odometry."""
 
 ROUNDS = 4
 """Most rounds of matching and loop closing."""
@@ -70,6 +70,13 @@ class MatchedDrive(NamedTuple):
     agreed: bool = False
 
 
+class Start(NamedTuple):
+    """Nodes from which matching starts, and the noise of the yaw that they have, radians a √metre."""
+
+    nodes: Callable[[], Floats]
+    noise: float
+
+
 def match_drive(
     odometry: Odometry,
     scans: Scans,
@@ -82,8 +89,8 @@ def match_drive(
 
     If a trajectory is `known`, J must be larger than that of it as well. A search that got lost somewhere ends
     elsewhere after small changes. So unless nearly all places are recognised, it is repeated from other starts and with
-    other windows held out, until two agree. J decides between them. If there is a trajectory from walls, it is always
-    one of the starts: on a bent trajectory, all places may be recognised.
+    other windows held out, until two agree. J decides between them, with the likelihood of odometry. If there is a
+    trajectory from walls, it is always one of the starts: on a bent trajectory, all places may be recognised.
 
     Parameters
     ----------
@@ -100,9 +107,8 @@ def match_drive(
     """
     remaining = min(REMAINING_YAW_NOISE, noise or REMAINING_YAW_NOISE)
     change = sensitivity(odometry, scans.windows)
-    best, value = None, scans.objective(scans.windows.node)
     least = -math.inf if known is None else scans.objective(known)
-    value = max(value, least)
+    enough = max(scans.objective(scans.windows.node), least)
 
     def scan_matched_with(trust: Trust, scans: Scans = scans) -> Floats:
         return scan_matched(scans, trust._replace(yaw=noise or trust.yaw), start_stage('scan matching'))
@@ -110,31 +116,46 @@ def match_drive(
     def finished(best: MatchedDrive, agreed: bool = False) -> MatchedDrive:
         return _at_likeliest_scale(best, start_stage, remaining, change)._replace(agreed=agreed)
 
-    starts: list[Callable[[], Floats]] = [partial(scan_matched_with, trust) for trust in TRUSTS]
-    if start is not None:
-        starts.insert(1, lambda: start)
-    for k, make in enumerate(starts):
+    usual, trusting = (Start(partial(scan_matched_with, trust), remaining) for trust in TRUSTS)
+    from_walls = [] if start is None else [Start(lambda: start, remaining)]
+    # a trajectory that is known shows that odometry is wrong
+    from_odometry = [] if known is not None else [Start(lambda: scans.windows.node, min(SMALL_YAW_NOISE, remaining))]
+    likeliest = log_likelihood_of_yaw(scans.windows, scans.windows.node)
+    best, value = None, -math.inf
+    for begin in (usual, *from_walls, *from_odometry, trusting):
         # more trust in readings does not help if nothing had a larger J than odometry
-        if make is starts[-1] and best is None:
+        if begin is trusting and best is None:
             return None
-        found = _rounds(scans, start_stage, make(), remaining, change, least)
+        # from odometry, the search ends at once if even the likelihood of odometry cannot make it the best
+        beyond = value - likeliest if begin in from_odometry else least
+        found = _rounds(scans, start_stage, begin.nodes(), begin.noise, change, beyond)
         agreed = best is not None and _agree(best.nodes, found.nodes)
-        if found.value > value:
-            best, value = found, found.value
-        walls_come_next = start is not None and k == 0
+        if found.value > enough and (score := _score(scans, found)) > value:
+            best, value = found, score
+        walls_come_next = bool(from_walls) and begin is usual
         if best is not None and not walls_come_next and (agreed or best.part >= NEARLY_ALL):
             return finished(best, agreed)
     assert best is not None
-    for begin in OTHERS if known is None else ():
-        other = scans.with_held_out(held_out(len(scans.windows), begin))
+    for fold in OTHERS if known is None else ():
+        other = scans.with_held_out(held_out(len(scans.windows), fold))
         of_odometry = other.objective(other.windows.node)
         found = _rounds(other, start_stage, scan_matched_with(TRUSTS[0], other), remaining, change)
         agreed = _agree(best.nodes, found.nodes)
-        if found.value > of_odometry and _objective(scans, found.nodes) > value:
-            best, value = found, scans.objective(found.nodes)
+        if found.value > of_odometry and (score := _score(scans, found)) > value:
+            best, value = found, score
         if agreed or best.part >= NEARLY_ALL:
             return finished(best, agreed)
     return finished(best)
+
+
+def _score(scans: Scans, found: MatchedDrive) -> float:
+    """Return J of a trajectory and the log-likelihood of odometry, nats.
+
+    A bent corridor may look straight to few sonars, and J may even be larger along it. But then odometry must have
+    made large errors.
+    """
+    value = found.value if found.scans is scans else _objective(scans, found.nodes)
+    return value + log_likelihood_of_yaw(scans.windows, found.nodes)
 
 
 def _agree(nodes: Floats, others: Floats) -> bool:

@@ -24,6 +24,10 @@ CALIBRATION = ('scale', 'heading', 'bias', 'turn_scale')
 CALIBRATION_SIGMA = np.array([0.03, math.radians(1.5), math.radians(1.5), 0.03])
 """σ of the prior of the calibration."""
 
+PIECE, FEWEST_PIECES, LEAST_ERROR = 2.0, 8, math.radians(0.3)
+"""Metres of progress of a piece whose yaw error is independent of that of others, fewest pieces, and smallest mean
+absolute error, radians: that of the trajectory."""
+
 
 @dataclass(frozen=True)
 class Noise:
@@ -117,3 +121,28 @@ def covariances(windows: Windows, noise: Noise) -> Floats:
     out[:, 1, 2] = out[:, 2, 1] = yaw * length / 2
     out[:, 2, 2] = yaw
     return out
+
+
+def log_likelihood_of_yaw(windows: Windows, nodes: Floats) -> float:
+    """Return the log-likelihood of the yaw of odometry if a trajectory is right, nats, without a constant.
+
+    The errors of the yaw of pieces of the drive, without those that are constant for a metre and for a turn, have a
+    Laplace distribution, since wheels slip now and then. Its mean absolute error b is the likeliest one:
+
+        log p  =  −n log b
+
+    Parameters
+    ----------
+    windows : Windows
+        Their nodes are the poses of odometry.
+    nodes : float64, shape (K, 3)
+        Of the trajectory.
+    """
+    ends = np.arange(windows.node_progress[0], windows.node_progress[-1], PIECE)
+    measured, yaw = np.unwrap(windows.node[:, 2]), np.unwrap(nodes[:, 2])
+    turned, error = (np.diff(np.interp(ends, windows.node_progress, angle)) for angle in (measured, yaw - measured))
+    if len(error) < FEWEST_PIECES:
+        return 0.0
+    constant = np.stack([np.ones(len(error)), turned], axis=1)
+    residual = error - constant @ np.linalg.lstsq(constant, error, rcond=None)[0]
+    return -len(error) * math.log(max(float(np.abs(residual).mean()), LEAST_ERROR))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 
 import numpy as np
@@ -34,6 +35,8 @@ class Trials:
         Metres by which each round moves the nodes.
     others : tuple of int
         Further folds that are tried.
+    of_odometry : float, float
+        The part of the blocks that are recognised from odometry as the start, and J; the nodes stay there.
     """
 
     def __init__(
@@ -42,6 +45,7 @@ class Trials:
         values: list[tuple[float, float]],
         far: float | list[float] = 1.0,
         others: tuple[int, ...] = (),
+        of_odometry: tuple[float, float] = (0.0, -math.inf),
     ) -> None:
         monkeypatch.setattr(any_angle, 'OTHERS', others)
         monkeypatch.setattr(any_angle, 'at_likeliest_scale', lambda scans, nodes, watch: (nodes, 1.0))
@@ -53,15 +57,28 @@ class Trials:
         self.found_before: list[Sequence[Loop]] = []
         monkeypatch.setattr(any_angle, 'MatchSolver', self._solver)
         monkeypatch.setattr(any_angle, 'scan_matched', lambda scans, trust, watch: scans.windows.node)
-        monkeypatch.setattr(Scans, 'objective', lambda *rest: values[len(self.calls) - 1][1] if self.calls else 0.0)
-        monkeypatch.setattr(any_angle, 'recognised_part', lambda *rest: values[len(self.calls) - 1][0])
+        monkeypatch.setattr(any_angle, 'recognised_part', lambda *rest: self._now()[0])
+        monkeypatch.setattr(Scans, 'objective', lambda *rest: self._now()[1] if self.calls else 0.0)
+        monkeypatch.setattr(any_angle, 'log_likelihood_of_yaw', lambda *rest: 0.0)
+        self._values, self._of_odometry = values, of_odometry
+        self.is_from_odometry = False
+        self.times_from_odometry = 0
+
+    def _now(self) -> tuple[float, float]:
+        return self._of_odometry if self.is_from_odometry else self._values[len(self.calls) - 1]
 
     def _solver(self, windows, scans, say, motion: Floats, noise: float, change) -> Trials:
+        self.is_from_odometry = noise == any_angle.SMALL_YAW_NOISE
+        if self.is_from_odometry:
+            self.times_from_odometry += 1
+            return self
         self.calls.append((motion, noise))
         self.change = change
         return self
 
     def with_matches(self, solution: Solution, found_before: Sequence[Loop] = ()) -> tuple[Solution, list[Loop]]:
+        if self.is_from_odometry:
+            return solution, []
         self.found_before.append(found_before)
         nodes = solution.nodes.copy()
         np.testing.assert_array_equal(self.calls[-1][0], relative(nodes[:-1], nodes[1:]))
@@ -144,12 +161,12 @@ def test_round_that_moves_nothing_is_the_last(bent, scans, monkeypatch) -> None:
 
 def test_given_noise_of_odometry_is_used(bent, scans, monkeypatch) -> None:
     trusts: list[scan_matching.Trust] = []
-    trials = Trials(monkeypatch, [(0.5, 1.0 + k) for k in range(4)], far=0.0)
+    trials = Trials(monkeypatch, [(0.5, 1.0 + k) for k in range(5)], far=0.0)
     monkeypatch.setattr(any_angle, 'scan_matched', lambda scans, trust, _: trusts.append(trust) or scans.windows.node)
     for noise in (0.0, 0.01):
         any_angle.match_drive(bent[1], scans, lambda stage: quietly, noise)
     assert trusts == [*TRUSTS, *(trust._replace(yaw=0.01) for trust in TRUSTS)]
-    assert [noise for _, noise in trials.calls] == [any_angle.REMAINING_YAW_NOISE] * 2 + [0.01] * 2
+    assert [noise for _, noise in trials.calls] == [any_angle.REMAINING_YAW_NOISE] * 2 + [0.01] * 3
 
 
 def test_rounds_end_early_below_the_j_of_a_known_trajectory(bent, scans, monkeypatch) -> None:
@@ -183,7 +200,8 @@ def test_given_nodes_are_another_start(
     start = scans.windows.node + np.array([5.0, 0.0, 0.0])
 
     def with_matches(trial: Trials, solution: Solution, found_before: Sequence[Loop]) -> tuple[Solution, list[Loop]]:
-        seen.append(solution.nodes[-1, 0] - scans.windows.node[-1, 0])
+        if not trial.is_from_odometry:
+            seen.append(solution.nodes[-1, 0] - scans.windows.node[-1, 0])
         return solve(trial, solution, found_before)
 
     monkeypatch.setattr(Trials, 'with_matches', with_matches)
@@ -309,3 +327,63 @@ def test_first_round_at_another_scale_searches_near_the_loop_closures_before(ben
     assert now.edges().pose[0] == pytest.approx([0.535, -0.214, 0.1])
     assert now.mean_score == matches.mean_score
     assert matches.edges().pose[0] == pytest.approx([0.5, -0.2, 0.1])
+
+
+@pytest.mark.parametrize(
+    ('first', 'of_odometry', 'is_taken', 'times'),
+    [
+        # if nearly all places are recognised from scan matching, odometry is no start
+        ((0.96, 1.0), (0.96, 2.0), False, 0),
+        ((0.5, 1.0), (0.96, 2.0), True, 1),
+        # with a smaller J, and with one that is not larger than that of odometry as it is
+        ((0.9, 3.0), (0.96, 2.0), False, 1),
+        ((0.9, 3.0), (0.96, -1.0), False, 1),
+    ],
+)
+def test_odometry_is_a_start_of_its_own(
+    bent, scans, monkeypatch, first, of_odometry, is_taken: bool, times: int
+) -> None:
+    trials = Trials(monkeypatch, [first, (0.5, 0.5), (0.96, 0.0)], of_odometry=of_odometry)
+    found = any_angle.match_drive(bent[1], scans, lambda stage: quietly)
+    assert found is not None
+    assert np.array_equal(found.nodes, scans.windows.node) == is_taken
+    assert found.value == (of_odometry if is_taken else first)[1]
+    assert trials.times_from_odometry == times
+
+
+def test_odometry_is_no_start_if_a_trajectory_shows_that_it_is_wrong(bent, scans, monkeypatch) -> None:
+    trials = Trials(monkeypatch, [(0.5, 1.0), (0.5, 0.5), (0.96, 0.5)], of_odometry=(0.96, 2.0))
+    known = scans.windows.node + 1.0
+    assert any_angle.match_drive(bent[1], scans, lambda stage: quietly, 0.0, known) is not None
+    assert trials.times_from_odometry == 0
+
+
+@pytest.mark.parametrize(('likelihood', 'is_taken'), [(0.5, False), (1.5, True)])
+def test_odometry_is_likelier_along_a_trajectory_near_it(
+    bent, scans, monkeypatch, likelihood: float, is_taken: bool
+) -> None:
+    Trials(monkeypatch, [(0.9, 2.0), (0.96, 0.0)], of_odometry=(0.96, 1.0))
+
+    def of_yaw(windows, nodes: Floats) -> float:
+        return likelihood if np.array_equal(nodes, windows.node) else 0.0
+
+    monkeypatch.setattr(any_angle, 'log_likelihood_of_yaw', of_yaw)
+    found = any_angle.match_drive(bent[1], scans, lambda stage: quietly)
+    assert found is not None
+    assert np.array_equal(found.nodes, scans.windows.node) == is_taken
+
+
+@pytest.mark.parametrize(('likelihood', 'times'), [(0.5, 1), (1.5, 2)])
+def test_search_from_odometry_ends_if_it_cannot_become_the_best(
+    bent, scans, monkeypatch, likelihood: float, times: int
+) -> None:
+    trials = Trials(monkeypatch, [(0.9, 3.0), (0.96, 0.0)], of_odometry=(0.5, 2.0))
+    # otherwise a round that moves nothing is the last
+    monkeypatch.setattr(any_angle, 'SETTLED', -1.0)
+
+    def of_yaw(windows, nodes: Floats) -> float:
+        return likelihood if np.array_equal(nodes, windows.node) else 0.0
+
+    monkeypatch.setattr(any_angle, 'log_likelihood_of_yaw', of_yaw)
+    assert any_angle.match_drive(bent[1], scans, lambda stage: quietly) is not None
+    assert trials.times_from_odometry == times
