@@ -24,12 +24,12 @@ from .fitting import fitted
 from .passes import Progress
 from .scans import FEWEST_ON_MAP, Scans
 
-SPAN, EVERY, MOST_PLACES, FEWEST_PLACES = 4.0, 4.0, 60, 4
+SPAN, EVERY, MOST_PLACES, FEWEST_PLACES = 4.0, 2.0, 120, 4
 """Metres of progress before and after the middle of a place whose windows make its map, metres from one place to the
 next, and most and fewest places."""
 
-FRAMES, OFFSET = 2, 0.1
-"""Maps of a place, along different axes, and largest offset of their origins, metres."""
+OFFSET = 0.1
+"""Largest offset of the origin of a map, along each axis, metres."""
 
 CHANGE = 0.05
 """Relative change of the scale, to both sides, that is tried."""
@@ -135,11 +135,10 @@ def _objectives(scans: Scans, nodes: Floats, middle: float, seed: int) -> list[f
     near = np.flatnonzero(np.abs(scans.windows.node_progress - middle) <= SPAN)
     if scans.count[near].sum() < FEWEST_ON_MAP:
         return None
-    rng, centre, quarter = np.random.default_rng(seed), nodes[near[len(near) // 2]], math.pi / 2
-    x, y, yaw = centre + rng.uniform(0.0, [OFFSET, OFFSET, quarter])
-    frames = [np.array([x, y, yaw + k * quarter / FRAMES]) for k in range(FRAMES)]
+    centre = nodes[near[len(near) // 2]]
+    frame = centre + np.random.default_rng(seed).uniform(0.0, [OFFSET, OFFSET, math.pi / 2])
     along = [enlarged(nodes, centre, 1.0 + change) for change in (-CHANGE, 0.0, CHANGE)]
-    return [sum(scans.objective_of(near, frame, nodes) for frame in frames) / FRAMES for nodes in along]
+    return [scans.objective_of(near, frame, scaled) for scaled in along]
 
 
 def _top(values: Floats) -> Floats:
