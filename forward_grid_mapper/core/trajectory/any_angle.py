@@ -58,6 +58,8 @@ class MatchedDrive(NamedTuple):
         Fraction of the blocks on an earlier visit that are recognised.
     scans : Scans
         With the windows that were held out.
+    noise : float
+        σ of the yaw of the start, radians a √metre.
     agreed : bool
         Whether another start led to the same trajectory.
     """
@@ -67,6 +69,7 @@ class MatchedDrive(NamedTuple):
     value: float
     part: float
     scans: Scans
+    noise: float = REMAINING_YAW_NOISE
     agreed: bool = False
 
 
@@ -114,7 +117,7 @@ def match_drive(
         return scan_matched(scans, trust._replace(yaw=noise or trust.yaw), start_stage('scan matching'))
 
     def finished(best: MatchedDrive, agreed: bool = False) -> MatchedDrive:
-        return _at_likeliest_scale(best, start_stage, remaining, change)._replace(agreed=agreed)
+        return _at_likeliest_scale(best, start_stage, change)._replace(agreed=agreed)
 
     usual, trusting = (Start(partial(scan_matched_with, trust), remaining) for trust in TRUSTS)
     from_walls = [] if start is None else [Start(lambda: start, remaining)]
@@ -188,16 +191,14 @@ def _rounds(
         value = _objective(scans, nodes)
         if best is not None and value <= best.value:
             break
-        best = MatchedDrive(nodes, loops, value, recognised_part(scans, nodes, loops), scans)
+        best = MatchedDrive(nodes, loops, value, recognised_part(scans, nodes, loops), scans, noise)
         if value <= least or best.part >= LEAST_RECOGNISED or rms_after_alignment(before, nodes) < SETTLED:
             break
     assert best is not None
     return best
 
 
-def _at_likeliest_scale(
-    found: MatchedDrive, start_stage: Callable[[str], Progress], noise: float, change: Floats
-) -> MatchedDrive:
+def _at_likeliest_scale(found: MatchedDrive, start_stage: Callable[[str], Progress], change: Floats) -> MatchedDrive:
     """Return the drive at the scale that readings show, matched once more there; `found` itself if it is right."""
     nodes, factor = at_likeliest_scale(found.scans, found.nodes, start_stage('scale'))
     if factor == 1.0:
@@ -208,8 +209,8 @@ def _at_likeliest_scale(
     # otherwise matches would undo a part of the change
     change = change.copy()
     change[:, :, CALIBRATION.index('scale')] = 0.0
-    again = _rounds(found.scans, start_stage, nodes, noise, change, found_before=loops)
-    return again if again.value > scaled.value else scaled
+    again = _rounds(found.scans, start_stage, nodes, found.noise, change, found_before=loops)
+    return max(scaled, again, key=partial(_score, found.scans))
 
 
 def _objective(scans: Scans, nodes: Floats) -> float:

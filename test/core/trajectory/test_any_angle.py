@@ -387,3 +387,20 @@ def test_search_from_odometry_ends_if_it_cannot_become_the_best(
     monkeypatch.setattr(any_angle, 'log_likelihood_of_yaw', of_yaw)
     assert any_angle.match_drive(bent[1], scans, lambda stage: quietly) is not None
     assert trials.times_from_odometry == times
+
+
+@pytest.mark.parametrize(('first', 'noise'), [(0.96, any_angle.REMAINING_YAW_NOISE), (0.5, any_angle.SMALL_YAW_NOISE)])
+def test_after_scaling_odometry_is_trusted_as_it_was_before(
+    bent, scans, monkeypatch, first: float, noise: float
+) -> None:
+    trials = Trials(monkeypatch, [(first, 1.0)] * 2, far=0.0, of_odometry=(0.96, 2.0))
+    Scales(monkeypatch, 1.05)
+    asked, solver = list[float](), trials._solver
+
+    def solve(windows, scans, say, motion: Floats, noise: float, change) -> Trials:
+        asked.append(noise)
+        return solver(windows, scans, say, motion, noise, change)
+
+    monkeypatch.setattr(any_angle, 'MatchSolver', solve)
+    assert any_angle.match_drive(bent[1], scans, lambda stage: quietly) is not None
+    assert asked[-1] == noise
