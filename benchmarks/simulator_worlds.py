@@ -1,7 +1,7 @@
 """Places like the worlds of well-known robot simulators, most of them without walls at right angles, for trajectories.
 
-And corridors that bend, or have a corner that is not square. The step for the scale was developed on the cave and the
-arena with seeds 0, 1, 5 and 12. Each function returns a world and the corners of a path through it, in metres.
+And corridors that bend, or have a corner that is not square. The scale was developed on the cave, the arena
+and the hexagon with seeds 0, 1 and 5. Each function returns a world and the corners of a path through it, in metres.
 """
 
 from __future__ import annotations

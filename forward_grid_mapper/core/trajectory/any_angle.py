@@ -38,7 +38,7 @@ ROUNDS = 4
 """Most rounds of matching and loop closing."""
 
 NEARLY_ALL = 0.95
-"""If so many of the blocks on an earlier visit are recognised, no other start is tried."""
+"""If so many of the blocks on an earlier visit are recognised, no other start is tried, except one from walls."""
 
 AGREED = 0.15
 """Two starts agree if their trajectories differ by less than this, metres (rms after alignment, also of the size)."""
@@ -104,7 +104,7 @@ def match_drive(
     noise : float
         σ of the yaw error of odometry, radians a √metre; 0 if it is not known.
     known : float64, shape (K, 3), optional
-        Nodes of a trajectory from walls that no reading contradicts.
+        Nodes of an accepted trajectory from walls whose corners are not contradicted.
     start : float64, shape (K, 3), optional
         Nodes of a trajectory from walls, from which matching starts, too.
     """
@@ -121,7 +121,7 @@ def match_drive(
 
     usual, trusting = (Start(partial(scan_matched_with, trust), remaining) for trust in TRUSTS)
     from_walls = [] if start is None else [Start(lambda: start, remaining)]
-    # a trajectory that is known shows that odometry is wrong
+    # an accepted trajectory shows that odometry is wrong
     from_odometry = [] if known is not None else [Start(lambda: scans.windows.node, min(SMALL_YAW_NOISE, remaining))]
     likeliest = log_likelihood_of_yaw(scans.windows, scans.windows.node)
     best, value = None, -math.inf
@@ -129,7 +129,7 @@ def match_drive(
         # more trust in readings does not help if nothing had a larger J than odometry
         if begin is trusting and best is None:
             return None
-        # from odometry, the search ends at once if even the likelihood of odometry cannot make it the best
+        # from odometry, only one round is made if its J could not be the best even with the largest likelihood
         beyond = value - likeliest if begin in from_odometry else least
         found = _rounds(scans, start_stage, begin.nodes(), begin.noise, change, beyond)
         agreed = best is not None and _agree(best.nodes, found.nodes)
@@ -205,7 +205,8 @@ def _at_likeliest_scale(found: MatchedDrive, start_stage: Callable[[str], Progre
         return found
     # places lie in the frames of nodes, which are farther apart by the same factor
     loops = [replace(loop, matches=loop.matches.scaled(factor)) for loop in found.loops]
-    scaled = found._replace(nodes=nodes, loops=loops, value=_objective(found.scans, nodes))
+    part = recognised_part(found.scans, nodes, loops)
+    scaled = found._replace(nodes=nodes, loops=loops, value=_objective(found.scans, nodes), part=part)
     # otherwise matches would undo a part of the change
     change = change.copy()
     change[:, :, CALIBRATION.index('scale')] = 0.0

@@ -4,7 +4,8 @@ J depends on where corridors lie. It depends as much on small errors, of centime
 Trajectories that were solved with different trust in odometry have different small errors. So before J decides between
 two, each is fitted to the map along it. All windows that are not held out are matched with the map of the other windows
 around them, of all visits. Then a pose graph is solved. It has these matches, and the shape that the trajectory had.
-This hardly moves a trajectory: places stay where they are.
+This hardly moves a trajectory: places stay where they are. After a change of the scale (`scale`), a trajectory is
+fitted as well, and is the result.
 """
 
 from __future__ import annotations

@@ -126,8 +126,8 @@ def covariances(windows: Windows, noise: Noise) -> Floats:
 def log_likelihood_of_yaw(windows: Windows, nodes: Floats) -> float:
     """Return the log-likelihood of the yaw of odometry if a trajectory is right, nats, without a constant.
 
-    The errors of the yaw of pieces of the drive, without those that are constant for a metre and for a turn, have a
-    Laplace distribution, since wheels slip now and then. Its mean absolute error b is the likeliest one:
+    The errors of the yaw of pieces of the drive, without those that are constant for a metre of progress and for a
+    turn, have a Laplace distribution, since wheels slip now and then. Its mean absolute error b is the likeliest one:
 
         log p  =  −n log b
 
@@ -139,8 +139,8 @@ def log_likelihood_of_yaw(windows: Windows, nodes: Floats) -> float:
         Of the trajectory.
     """
     ends = np.arange(windows.node_progress[0], windows.node_progress[-1], PIECE)
-    measured, yaw = np.unwrap(windows.node[:, 2]), np.unwrap(nodes[:, 2])
-    turned, error = (np.diff(np.interp(ends, windows.node_progress, angle)) for angle in (measured, yaw - measured))
+    measured, error = np.unwrap(windows.node[:, 2]), np.unwrap(wrapped(nodes[:, 2] - windows.node[:, 2]))
+    turned, error = (np.diff(np.interp(ends, windows.node_progress, angle)) for angle in (measured, error))
     if len(error) < FEWEST_PIECES:
         return 0.0
     constant = np.stack([np.ones(len(error)), turned], axis=1)

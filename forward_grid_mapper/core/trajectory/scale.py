@@ -60,7 +60,7 @@ def scale_error(scans: Scans, nodes: Floats, watch: Progress = lambda part: None
     """Return by how much a trajectory is too small.
 
     J of the maps of all places is a parabola of the scale near its maximum. The standard error is that of the bootstrap
-    over places.
+    over places. Maps of neighbouring places share readings, so it may be too small by a factor of two.
 
     Parameters
     ----------
@@ -101,25 +101,25 @@ def at_likeliest_scale(scans: Scans, nodes: Floats, watch: Progress = lambda par
     best, factor, least = nodes, 1.0, math.inf
     scaled, by = nodes, 1.0
     for k in range(ROUNDS):
-        error = scale_error(scans, scaled, partial(_in_round, watch, k))
-        if abs(error.value) < (max(SETTLED, error.sigma) if k else max(LEAST_CHANGE, LEAST_SIGMAS * error.sigma)):
-            break
-        change = 1.0 + error.value
         try:
+            error = scale_error(scans, scaled, partial(_in_round, watch, k))
+            if abs(error.value) < (max(SETTLED, error.sigma) if k else max(LEAST_CHANGE, LEAST_SIGMAS * error.sigma)):
+                break
             if not k:
                 least = scans.objective(fitted(scans, nodes))
+            change = 1.0 + error.value
             scaled, by = fitted(scans, enlarged(scaled, scaled[0], change)), by * change
             if scans.objective(scaled) > least:
                 best, factor = scaled, by
         except InputError:
-            # the map along a larger trajectory may be too large
+            # a map may be too large along a larger trajectory, or in other axes
             break
         watch((k + 1) / ROUNDS)
     return best, factor
 
 
 def _in_round(watch: Progress, k: int, part: float) -> None:
-    """Report the progress of round k, of which the error takes about a half."""
+    """Report the progress of round k while the error is found; fitting is the other half."""
     watch((k + part / 2) / ROUNDS)
 
 

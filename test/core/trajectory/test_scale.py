@@ -90,6 +90,7 @@ def test_from_few_places_nothing_is_known(scans, true, monkeypatch) -> None:
 
 def test_places_are_bounded_and_all_over_the_drive(scans, true, monkeypatch) -> None:
     middles = list[float]()
+    monkeypatch.setattr(scans, 'threads', 1)
     monkeypatch.setattr(scale, '_objectives', lambda scans, nodes, middle, seed: middles.append(middle))
     scale_error(scans, true)
     assert np.diff(middles) == pytest.approx(scale.EVERY)
@@ -184,6 +185,18 @@ def test_scale_is_kept_if_its_map_would_be_too_large(monkeypatch, scans, true) -
     nodes, by = at_likeliest_scale(scans, true)
     assert by == pytest.approx(1.02)
     assert nodes is steps.fitted[1]
+
+
+def test_scale_is_kept_if_the_map_of_a_place_would_be_too_large(monkeypatch, scans, true) -> None:
+    Steps(monkeypatch, [])
+
+    def too_large(*rest) -> ScaleError:
+        raise InputError('the map would be too large')
+
+    monkeypatch.setattr(scale, 'scale_error', too_large)
+    nodes, by = at_likeliest_scale(scans, true)
+    assert nodes is true
+    assert by == 1.0
 
 
 def test_enlarged_nodes_keep_their_directions_and_the_shape(true) -> None:
