@@ -593,3 +593,26 @@ def test_votes_due_to_the_layout_of_sensors_are_no_evidence(bent, monkeypatch, b
     windows = cut(readings, odometry)
     scans = Scans(windows, Parameters(), np.zeros(1, np.uint8), held_out(len(windows)))
     assert right_angles.heading_of_walls(windows, scans, 0.0) == (found, evidence)
+
+
+@pytest.mark.parametrize('contradicted', [False, True])
+def test_accepted_walls_limit_matching_unless_corners_contradict_them(bent, monkeypatch, contradicted: bool) -> None:
+    readings, odometry = bent
+    asked: list[tuple[Floats | None, Floats | None]] = []
+
+    def at_right_angles(drive: Drive, *rest, **options) -> Attempt:
+        nodes = drive.windows.node * (1.2, 1.0, 1.0)
+        outcome = Refinement(True, 'walls', readings, odometry, {})
+        return Attempt(outcome, nodes, turns_contradicted=contradicted)
+
+    def matched(odometry: Odometry, scans: Scans, stage, noise: float, known, start) -> None:
+        asked.append((known, start))
+
+    monkeypatch.setattr(refinement, 'at_right_angles', at_right_angles)
+    monkeypatch.setattr(refinement, 'start_from', lambda scans, attempt: attempt.nodes * (1.0, 2.0, 1.0))
+    monkeypatch.setattr(refinement, 'match_drive', matched)
+    found = Refiner(Parameters()).run(readings, odometry)
+    assert found.accepted and found.reason == 'walls'
+    (known, start) = asked[0]
+    assert (known is None) == contradicted
+    assert (start is not None) == contradicted
