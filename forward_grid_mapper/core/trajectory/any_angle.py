@@ -25,7 +25,7 @@ from .passes import Progress
 from .pose_graph import solution_at
 from .poses import relative, rms_after_alignment
 from .relocating import LEAST_RECOGNISED, recognised_part
-from .scale import at_likeliest_scale
+from .scale import at_likeliest_scale, enlarged
 from .scan_matching import TRUSTS, Trust, scan_matched
 from .scans import Scans
 from .solving import SETTLED, MatchSolver
@@ -165,9 +165,7 @@ def _agree(nodes: Floats, others: Floats) -> bool:
     """Return whether two trajectories agree, apart from their size, which is changed last."""
     middle = others[:, :2].mean(0)
     spread = [float(np.square(each[:, :2] - each[:, :2].mean(0)).sum()) for each in (nodes, others)]
-    sized = others.copy()
-    sized[:, :2] = middle + math.sqrt(spread[0] / spread[1]) * (others[:, :2] - middle)
-    return rms_after_alignment(nodes, sized) < AGREED
+    return rms_after_alignment(nodes, enlarged(others, middle, math.sqrt(spread[0] / spread[1]))) < AGREED
 
 
 def _rounds(

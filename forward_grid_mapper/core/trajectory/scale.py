@@ -38,7 +38,7 @@ SAMPLES = 200
 """Number of samples of the bootstrap."""
 
 AT_TRUE_SCALE = 0.01
-"""Relative change of the scale that J prefers along true poses: 0.005 to 0.026 in simulated and recorded drives."""
+"""Relative change of the scale that J prefers along true poses; it differs by a per cent and more between drives."""
 
 LEAST_CHANGE, LEAST_SIGMAS = 0.008, 2.0
 """The scale is changed if it is off by this much, and by this many standard errors."""
@@ -124,7 +124,7 @@ def _in_round(watch: Progress, k: int, part: float) -> None:
 
 
 def enlarged(nodes: Floats, centre: Floats, factor: float) -> Floats:
-    """Return the nodes with distances from a point, shape (2,) or more, multiplied by a factor."""
+    """Return the nodes with distances from a point multiplied by a factor; x and y of the point come first."""
     out = nodes.copy()
     out[:, :2] = centre[:2] + factor * (nodes[:, :2] - centre[:2])
     return out
@@ -144,7 +144,8 @@ def _objectives(scans: Scans, nodes: Floats, middle: float, seed: int) -> list[f
 def _top(values: Floats) -> Floats:
     """Return the change of the scale at the top of the parabola through J, `CHANGE` at most; values of shape (…, 3).
 
-    Far from the maximum, J has no top. There it is larger on the side of the maximum.
+    Far from the maximum, J has no top (`certainty.parabola_top` then knows nothing). There it is larger on the side of
+    the maximum.
     """
     smaller, same, larger = np.moveaxis(values, -1, 0)
     curvature, slope = np.maximum(2.0 * same - smaller - larger, 1e-9), larger - smaller
